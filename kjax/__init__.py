@@ -1,0 +1,27 @@
+"""kjax: Koopman-operator linear MPC for legged robots, in JAX.
+
+    from kjax import RunConfig, build_controller, build_params, load_config
+    from kjax.robots import go1
+
+The core imports jax, numpy and pydantic only; ``kjax.sim`` needs the extra ``sim`` (MuJoCo),
+``kjax.viz`` the extra ``viz`` (matplotlib).
+"""
+
+from kjax.config import ConfigError, RunConfig, load_config
+from kjax.controller import Controller, ControllerParams, build_controller, build_params
+from kjax.types import Leg, Mode, Observation
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ConfigError",
+    "Controller",
+    "ControllerParams",
+    "Leg",
+    "Mode",
+    "Observation",
+    "RunConfig",
+    "build_controller",
+    "build_params",
+    "load_config",
+]

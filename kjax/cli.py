@@ -1,0 +1,1 @@
+"""Command line, output folders and provenance of the experiments."""

@@ -1,0 +1,406 @@
+"""Configuration: frozen dataclasses filled from TOML; a wrong key or value is one clear line.
+
+Every field's docstring ends with its unit in brackets; ``--help`` of the experiments shows them.
+"""
+
+import dataclasses
+import difflib
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+from pydantic.fields import FieldInfo
+
+_STRICT = ConfigDict(extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(gt=0)]
+# The only quantities that may be infinite: bounds that a user wants to switch off.
+Bound = Annotated[float, Field(allow_inf_nan=True)]
+
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names file, key, value and wish."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class CommandConfig:
+    """Forward velocity command: a step function of time."""
+
+    times: tuple[NonNegative, ...] = (0.0, 6.0, 10.0, 14.0, 18.0)
+    """Start of each piece, increasing, the first one 0 [s]."""
+    velocities: tuple[float, ...] = (0.0, 0.1, 0.3, 0.2, 0.0)
+    """Velocity that holds from each of those times on [m/s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "CommandConfig":
+        if len(self.times) != len(self.velocities):
+            raise ValueError(
+                f"times and velocities must be equally long, got {len(self.times)} and "
+                f"{len(self.velocities)}"
+            )
+        if not self.times or self.times[0] != 0.0:
+            raise ValueError(f"times must start at 0, got {list(self.times)}")
+        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError(f"times must increase, got {list(self.times)}")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class SrbConfig:
+    """Single rigid body that the models are fitted to."""
+
+    mass: Positive = 12.743
+    """Mass of the body; the Go1's by default [kg]."""
+    inertia: Positive = 0.394
+    """Pitch inertia about the centre of mass; the whole Go1's in its stance by default [kg m^2]."""
+    feet_front: tuple[float, float] = (0.190, -0.250)
+    """Front contact point (x, z) relative to the centre of mass, body frame [m]."""
+    feet_rear: tuple[float, float] = (-0.186, -0.250)
+    """Rear contact point (x, z) relative to the centre of mass, body frame [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class DatasetConfig:
+    """Random SRB rollouts that the models are fitted to; uniform in the ranges given here."""
+
+    rollouts: Count = 100
+    """Number of rollouts per contact mode [-]."""
+    duration: Positive = 0.1
+    """Length of a rollout [s]."""
+    dt: Positive = 0.001
+    """Runge-Kutta and snapshot step [s]."""
+    hold: Count = 1
+    """Number of steps for which each random force is held [-]."""
+    height: Positive = 0.27
+    """Centre of the sampled heights [m]."""
+    state_range: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (0.5, 0.1, 0.3, 1.0, 0.5, 2.0)
+    """Half-ranges of the initial (p_x, p_z, theta, v_x, v_z, omega) [m, rad, m/s, rad/s]."""
+    force_x: NonNegative = 60.0
+    """Half-range of each leg's F_x, body frame [N]."""
+    force_z: tuple[float, float] = (0.0, 150.0)
+    """Range of each leg's F_z, body frame [N]."""
+    feet_range: tuple[NonNegative, NonNegative] = (0.12, 0.05)
+    """Half-ranges of the contact points' (x, z); used by koopman.feet = "measured" only [m]."""
+    seed: int = 1
+    """Seed of the training rollouts [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "DatasetConfig":
+        if self.force_z[0] > self.force_z[1]:
+            raise ValueError(f"force_z must be (low, high), got {list(self.force_z)}")
+        if round(self.duration / self.dt) < 1:
+            raise ValueError(f"duration {self.duration} s holds no step of dt {self.dt} s")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class KoopmanConfig:
+    """EDMD models, one per contact mode."""
+
+    dictionary: Literal["paper", "paper_literal"] = "paper"
+    """The paper's dictionary without its duplicate columns, or letter by letter [-]."""
+    order: Annotated[int, Field(ge=0, le=8)] = 4
+    """Highest power p of the pitch rate in the dictionary [-]."""
+    constant_rotation: bool = False
+    """Whether to add R itself (the k = 0 term), which the paper leaves out [-]."""
+    feet: Literal["fixed", "measured"] = "fixed"
+    """Contact points of the model: constant per mode (the paper) or the robot's own [-]."""
+    dataset: DatasetConfig = DatasetConfig()
+    """Training data."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class LmpcConfig:
+    """Linear MPC on the lifted models."""
+
+    control_dt: Positive = 0.005
+    """Time between two plans [s]."""
+    model_dt: Positive = 0.001
+    """Step of the prediction model, a multiple of koopman.dataset.dt [s]."""
+    horizon: Count = 6
+    """Length of the prediction, in steps of model_dt [-]."""
+    state_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (2000.0, 3e4, 1200.0, 12.0, 3.0, 0.08)
+    """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
+    input_weight: Positive = 1e-5
+    """R of every force [1/N^2]."""
+    input_reference: Literal["zero", "hover"] = "zero"
+    """What R penalises the distance from: no force (the paper) or half the weight each [-]."""
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 60.0
+    """Bound of |F_x| per leg, body frame [N]."""
+    force_z_min: Bound = 0.0
+    """Lower bound of F_z per leg, body frame [N]."""
+    force_z_max: Bound = 160.0
+    """Upper bound of F_z per leg, body frame [N]."""
+    height: Positive = 0.27
+    """Reference height of the centre of mass above ground [m]."""
+    position_slack: Positive = 0.10
+    """Largest lead or lag of the integrated position reference before the body [m]."""
+    solver: Literal["admm", "projected_gradient"] = "admm"
+    """Method of the box QP [-]."""
+    tolerance: Positive = 1e-6
+    """Relative KKT residual at which the QP counts as solved [-]."""
+    max_iterations: Count = 2000
+    """Iteration limit of the QP [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "LmpcConfig":
+        if not self.force_z_min <= self.force_z_max:
+            raise ValueError(
+                f"force_z_min must not exceed force_z_max, got {self.force_z_min} and "
+                f"{self.force_z_max}"
+            )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class GaitConfig:
+    """Which legs stand when."""
+
+    name: Literal["trot", "stand"] = "trot"
+    """Gait to walk in [-]."""
+    stance_time: Positive = 0.25
+    """Duration of each trot phase, stance of one diagonal and swing of the other [s]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class LegConfig:
+    """Swing trajectory, footholds and joint control."""
+
+    apex: Positive = 0.06
+    """Height of the swing above the higher of lift-off and target [m]."""
+    horizontal_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
+    """Part of the swing after which the foot has arrived above its foothold [-]."""
+    velocity_gain: NonNegative = 0.03
+    """Raibert gain on the velocity error in the foothold [s]."""
+    hold_after: Annotated[float, Field(ge=0, le=1)] = 0.3
+    """Part of the swing after which a contact is an obstacle and the foot is held [-]."""
+    kp: NonNegative = 150.0
+    """Stiffness of thigh and calf joint in swing [N m/rad]."""
+    kd: NonNegative = 3.0
+    """Damping of thigh and calf joint in swing [N m s/rad]."""
+    kp_abduction: NonNegative = 200.0
+    """Stiffness that holds the abduction joint of the planar robot [N m/rad]."""
+    kd_abduction: NonNegative = 4.0
+    """Damping of the abduction joint of the planar robot [N m s/rad]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class NoiseConfig:
+    """Sensor noise (white, each physics step) and spread of the initial state; 1 sigma each."""
+
+    enabled: bool = True
+    """Whether noise and initial spread are applied [-]."""
+    position: NonNegative = 0.001
+    """Trunk position [m]."""
+    pitch: NonNegative = 0.003
+    """Trunk orientation [rad]."""
+    velocity: NonNegative = 0.02
+    """Trunk velocity [m/s]."""
+    pitch_rate: NonNegative = 0.05
+    """Trunk angular velocity [rad/s]."""
+    joint_position: NonNegative = 0.001
+    """Joint angles [rad]."""
+    joint_velocity: NonNegative = 0.02
+    """Joint rates [rad/s]."""
+    initial_pitch: NonNegative = 0.02
+    """Pitch at the start [rad]."""
+    initial_velocity: NonNegative = 0.05
+    """Trunk velocity at the start [m/s]."""
+    initial_pitch_rate: NonNegative = 0.2
+    """Trunk pitch rate at the start [rad/s]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class SimConfig:
+    """Physics."""
+
+    sim_dt: Positive = 0.001
+    """Physics step; torques are recomputed at each [s]."""
+    base: Literal["planar"] = "planar"
+    """Trunk on two slides and a pitch hinge (the free base comes with 3D control) [-]."""
+    friction: Positive = 0.8
+    """Sliding friction coefficient of the feet [-]."""
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    """Friction cone of the contact solver; MJX wants the pyramid [-]."""
+    contacts: Literal["all", "feet"] = "all"
+    """Which of the robot's bodies touch the ground: all, or the feet only (faster) [-]."""
+    joint_damping: NonNegative = 0.1
+    """Viscous joint damping [N m s/rad]."""
+    joint_armature: NonNegative = 0.01
+    """Reflected rotor inertia [kg m^2]."""
+    contact_threshold: NonNegative = 5.0
+    """Foot force above which the contact sensor fires [N]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RunConfig:
+    """One closed-loop run."""
+
+    duration: Positive = 22.0
+    """Simulated time [s]."""
+    seed: int = 0
+    """Seed of noise and initial state [-]."""
+    command: CommandConfig = CommandConfig()
+    """Velocity command."""
+    srb: SrbConfig = SrbConfig()
+    """Single rigid body of the prediction."""
+    koopman: KoopmanConfig = KoopmanConfig()
+    """Prediction models."""
+    lmpc: LmpcConfig = LmpcConfig()
+    """Model predictive control."""
+    gait: GaitConfig = GaitConfig()
+    """Gait."""
+    leg: LegConfig = LegConfig()
+    """Swing legs."""
+    sim: SimConfig = SimConfig()
+    """Physics."""
+    noise: NoiseConfig = NoiseConfig()
+    """Noise."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "RunConfig":
+        _require_multiple("lmpc.control_dt", self.lmpc.control_dt, "sim.sim_dt", self.sim.sim_dt)
+        _require_multiple(
+            "lmpc.model_dt", self.lmpc.model_dt, "koopman.dataset.dt", self.koopman.dataset.dt
+        )
+        if self.gait.stance_time < self.lmpc.control_dt:
+            raise ValueError(
+                f"gait.stance_time {self.gait.stance_time} s is shorter than lmpc.control_dt "
+                f"{self.lmpc.control_dt} s"
+            )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class FitStudyConfig:
+    """The fit study of the paper's Fig. 3."""
+
+    srb: SrbConfig = SrbConfig()
+    """Single rigid body."""
+    koopman: KoopmanConfig = KoopmanConfig()
+    """Models and training data."""
+    test_states: Count = 50
+    """Number of random initial states per mode [-]."""
+    test_profiles: Count = 50
+    """Number of random force profiles, each applied to every initial state [-]."""
+    test_duration: Positive = 0.05
+    """Length of a test rollout [s]."""
+    test_seed: int = 1000
+    """Seed of the test set [-]."""
+    scales: tuple[Positive, ...] = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+    """Sampling ranges of the scan, as fractions of koopman.dataset's [-]."""
+    tolerance: Positive = 1e-4
+    """Error that the paper claims; the scan reports the largest range within it [m, rad, ...]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "FitStudyConfig":
+        _require_multiple(
+            "test_duration", self.test_duration, "koopman.dataset.dt", self.koopman.dataset.dt
+        )
+        return self
+
+
+def _require_multiple(name: str, value: float, base_name: str, base: float) -> None:
+    ratio = value / base
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
+        raise ValueError(
+            f"{name} must be a whole multiple of {base_name}, got {value} s and {base} s"
+        )
+
+
+def fields(cls: type, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
+    """Leaf keys of a config class as (dotted name, field, default)."""
+    for name, info in cls.__pydantic_fields__.items():  # type: ignore[attr-defined]
+        if dataclasses.is_dataclass(info.annotation):
+            yield from fields(info.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
+        else:
+            yield f"{prefix}{name}", info, info.default
+
+
+def load_config(
+    cls: type[T], path: str | Path | None = None, overrides: Mapping[str, Any] | None = None
+) -> T:
+    """Config of type ``cls`` from a TOML file, with overrides by dotted name.
+
+    Args:
+      cls: a config dataclass of this module.
+      path: TOML file; ``None`` means all defaults.
+      overrides: e.g. ``{"lmpc.horizon": 10}``; they win over the file.
+
+    Raises:
+      ConfigError: with one line that names the file, the key, what came and what was wanted.
+    """
+    data: dict[str, Any] = {}
+    source = "command line"
+    if path is not None:
+        source = str(path)
+        try:
+            data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise ConfigError(f"{source}: no such file{_nearest_file(Path(path))}") from None
+        except OSError as error:
+            raise ConfigError(f"{source}: cannot be read: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    for key, value in (overrides or {}).items():
+        *sections, leaf = key.split(".")
+        node = data
+        for section in sections:
+            node = node.setdefault(section, {})
+            if not isinstance(node, dict):
+                raise ConfigError(f"{source}: {key}: '{section}' is a value, not a section")
+        node[leaf] = value
+    try:
+        # Through JSON, since strict mode then takes lists for tuples but still no "3" for 3.
+        return TypeAdapter(cls).validate_json(json.dumps(data, default=str), strict=True)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(error, cls)}") from None
+
+
+def _explain(error: ValidationError, cls: type) -> str:
+    """One line on the first problem, and how many more there are."""
+    first, *rest = error.errors(include_url=False)
+    loc = tuple(str(part) for part in first["loc"])
+    key = ".".join(loc)
+    came = first["input"]
+    if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        names = {name for name, _, _ in fields(cls)}
+        names |= {name.rsplit(".", 1)[0] for name in names if "." in name}
+        near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        text = f"{key}: unknown key (got {came!r}){hint}"
+    elif first["type"] == "value_error":
+        wish = first["msg"].removeprefix("Value error, ")
+        text = f"{key}: {wish}" if key else wish
+    else:
+        wish = first["msg"].removeprefix("Input should be ")
+        options = [str(o) for o in first.get("ctx", {}).get("expected", "").split("'")[1::2]]
+        near = difflib.get_close_matches(str(came), options, n=1, cutoff=0.5)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        text = f"{key}: got {came!r}, wanted {wish}{hint}"
+    return text + (f" (and {len(rest)} more)" if rest else "")
+
+
+def _nearest_file(path: Path) -> str:
+    if not path.parent.is_dir():
+        return ""
+    near = difflib.get_close_matches(path.name, [p.name for p in path.parent.glob("*.toml")], n=1)
+    return f"; did you mean '{path.parent / near[0]}'?" if near else ""
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The config as nested plain data (lists for tuples), ready for TOML or JSON."""
+    return TypeAdapter(type(config)).dump_python(config, mode="json")

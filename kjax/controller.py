@@ -1,0 +1,369 @@
+"""The controller: pure functions ``init``, ``plan``, ``act`` and ``step`` over plain pytrees.
+
+``plan`` runs at the MPC rate: phase clock, reference, lift, QP. ``act`` runs at the physics rate:
+swing feet follow their paths, stance feet press the planned forces. Both take and return the same
+``ControllerState``; nothing is hidden, so they run in a Python loop, in ``lax.scan`` and under
+``vmap`` alike. The caller owns ``jit``.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from kjax import gait, qp
+from kjax.config import RunConfig
+from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
+from kjax.legs import swing
+from kjax.legs.kinematics import PlanarState, planar_state
+from kjax.legs.stance import stance_torque
+from kjax.mpc.lmpc import LmpcTables, build_tables, reference_trajectory, shift_plan, solve_lmpc
+from kjax.types import LEG_PAIR, Command, Observation, RobotParams
+
+
+class ControllerParams(NamedTuple):
+    """All numbers of a controller; data, so any leaf may be batched or replaced.
+
+    Attributes:
+      robot: geometry and masses.
+      tables: LMPC per contact mode.
+      schedule: gaits.
+      gait: index of the gait to start in.
+      swing: swing settings.
+      command: forward velocity over time.
+      height: reference height of the centre of mass [m].
+      position_slack: clamp of the position reference [m].
+    """
+
+    robot: RobotParams
+    tables: LmpcTables
+    schedule: gait.Schedule
+    gait: Int[Array, ""]
+    swing: swing.SwingParams
+    command: Command
+    height: Float[Array, ""]
+    position_slack: Float[Array, ""]
+
+
+class ControllerState(NamedTuple):
+    """What the controller remembers between calls.
+
+    Attributes:
+      time: since ``init`` [s].
+      clock: place in the gait.
+      stance: (4,) scheduled stance legs.
+      position: integrated reference of p_x [m].
+      velocity_command: velocity commanded now [m/s].
+      plan: (4k,) last force plan, body frame [N].
+      force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
+      swing: state of the swing legs.
+    """
+
+    time: Float[Array, ""]
+    clock: gait.Clock
+    stance: Bool[Array, "4"]
+    position: Float[Array, ""]
+    velocity_command: Float[Array, ""]
+    plan: Float[Array, "nu"]
+    force: Float[Array, "4 2"]
+    swing: swing.SwingState
+
+
+class PlanInfo(NamedTuple):
+    """What a plan did; for logs and for callers that must know.
+
+    Attributes:
+      status: a ``qp.Status``. At the iteration limit the solver's last point is in force; with
+        faulty data the shifted last plan is.
+      residual: relative KKT residual of the solver's point [-].
+      iterations: of the solver.
+      mode: contact mode.
+      x: (6,) SRB state as estimated from the observation.
+      reference: (6,) state wanted one model step ahead.
+    """
+
+    status: Int[Array, ""]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    mode: Int[Array, ""]
+    x: Float[Array, "6"]
+    reference: Float[Array, "6"]
+
+
+class Controller(NamedTuple):
+    """A controller is a record of pure functions.
+
+    Attributes:
+      init: (params, observation) -> state.
+      plan: (params, state, observation) -> (state, info), once per control_dt.
+      act: (params, state, observation) -> (state, torque), once per sim_dt; torque (4, 3) [N m]
+        of (abduction, thigh, calf) in leg order, within the robot's limits.
+      step: plan, then act: (params, state, observation) -> (state, torque, info).
+    """
+
+    init: Callable[[ControllerParams, Observation], ControllerState]
+    plan: Callable[
+        [ControllerParams, ControllerState, Observation], tuple[ControllerState, PlanInfo]
+    ]
+    act: Callable[
+        [ControllerParams, ControllerState, Observation],
+        tuple[ControllerState, Float[Array, "4 3"]],
+    ]
+    step: Callable[
+        [ControllerParams, ControllerState, Observation],
+        tuple[ControllerState, Float[Array, "4 3"], PlanInfo],
+    ]
+
+
+def build_controller(config: RunConfig) -> Controller:
+    """Controller functions for the static choices of a config (rates, horizon, solver)."""
+    lmpc = config.lmpc
+    sim_dt = config.sim.sim_dt
+    lift = build_dictionary(config.koopman).lift
+    measured_feet = config.koopman.feet == "measured"
+
+    def init(params: ControllerParams, observation: Observation) -> ControllerState:
+        body = planar_state(params.robot, _cast(observation, params))
+        zero = jnp.zeros_like(params.height)
+        return ControllerState(
+            time=zero,
+            clock=gait.Clock(
+                gait=params.gait,
+                phase=jnp.zeros_like(params.gait),
+                elapsed=zero - lmpc.control_dt,  # the first plan enters phase 0
+            ),
+            stance=jnp.ones((4,), bool),
+            position=body.x[0],
+            velocity_command=zero,
+            plan=jnp.zeros_like(params.tables.lower[0]),
+            force=jnp.zeros((4, 2), zero.dtype),
+            swing=swing.initial_swing(body.feet),
+        )
+
+    def plan(
+        params: ControllerParams, state: ControllerState, observation: Observation
+    ) -> tuple[ControllerState, PlanInfo]:
+        observation = _cast(observation, params)
+        readable = _all_finite(observation)
+        body = planar_state(params.robot, _stand_in(observation, readable, params))
+        schedule = params.schedule
+
+        clock = gait.advance(schedule, state.clock, lmpc.control_dt)
+        where = (clock.gait, clock.phase)
+        stance, mode = schedule.stance[where], schedule.mode[where]
+        lifting = state.stance & ~stance
+        swings = swing.begin_swings(
+            state.swing, lifting, body.feet, schedule.time_to_touchdown[where] - clock.elapsed
+        )
+        swings = swings._replace(held=swings.held & ~stance)
+
+        command = _command_at(params.command, state.time)
+        slack = params.position_slack
+        position = jnp.clip(
+            state.position + command * lmpc.control_dt, body.x[0] - slack, body.x[0] + slack
+        )
+        reference = reference_trajectory(
+            position=position,
+            height=params.height,
+            velocity=command,
+            model_dt=lmpc.model_dt,
+            horizon=lmpc.horizon,
+        )
+        warm = shift_plan(state.plan, lmpc)
+        solution = solve_lmpc(
+            params.tables,
+            mode,
+            lift(body.x),
+            reference,
+            warm,
+            lmpc,
+            feet=_contact_points(params.robot, body, stance) if measured_feet else None,
+        )
+        # Out of iterations, the solver's point is feasible and no worse than its start; only
+        # faulty data makes the shifted last plan the better choice.
+        usable = (solution.status <= qp.Status.ITERATION_LIMIT) & readable
+        fallback = jnp.clip(warm, params.tables.lower[mode], params.tables.upper[mode])
+        forces = jnp.where(usable, solution.x, fallback)
+
+        moved = ControllerState(
+            time=state.time + lmpc.control_dt,
+            clock=clock,
+            stance=stance,
+            position=jnp.where(readable, position, state.position),
+            velocity_command=command,
+            plan=forces,
+            force=forces[:4].reshape(2, 2)[LEG_PAIR] * stance[:, None],
+            swing=jax.tree.map(lambda new, old: jnp.where(readable, new, old), swings, state.swing),
+        )
+        info = PlanInfo(
+            status=jnp.where(readable, solution.status, qp.Status.NON_FINITE).astype(jnp.int32),
+            residual=jnp.where(readable, solution.residual, jnp.inf),
+            iterations=solution.iterations,
+            mode=mode,
+            x=body.x,
+            reference=reference[0],
+        )
+        return moved, info
+
+    def act(
+        params: ControllerParams, state: ControllerState, observation: Observation
+    ) -> tuple[ControllerState, Array]:
+        observation = _cast(observation, params)
+        readable = _all_finite(observation)
+        observation = _stand_in(observation, readable, params)
+        robot = params.robot
+        body = planar_state(robot, observation)
+        where = (state.clock.gait, state.clock.phase)
+
+        swings = swing.continue_swings(
+            params.swing,
+            state.swing,
+            ~state.stance & readable,
+            observation.contact,
+            body.feet,
+            sim_dt,
+        )
+        x_target = swing.foothold(
+            robot,
+            params.swing,
+            body,
+            jnp.maximum(swings.duration - swings.elapsed, 0.0),
+            params.schedule.stance_time[where],
+            state.velocity_command,
+        )
+        target = jnp.stack([x_target, jnp.full_like(x_target, robot.foot_radius)], axis=-1)
+        position, velocity = swing.foot_reference(params.swing, swings, target)
+        angle, rate = swing.joint_reference(robot, body, position, velocity)
+        follow = swing.swing_torque(
+            params.swing, observation.joint_pos, observation.joint_vel, angle, rate
+        )
+        press = stance_torque(robot, body.trig, state.force)
+        sagittal = jnp.where(state.stance[:, None], press, follow)
+        abduction = (
+            -params.swing.kp[0] * observation.joint_pos[:, 0]
+            - params.swing.kd[0] * observation.joint_vel[:, 0]
+        )
+        torque = jnp.concatenate([abduction[:, None], sagittal], axis=-1)
+        torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
+        return state._replace(swing=swings), jnp.where(readable, torque, 0.0)
+
+    def step(
+        params: ControllerParams, state: ControllerState, observation: Observation
+    ) -> tuple[ControllerState, Array, PlanInfo]:
+        state, info = plan(params, state, observation)
+        state, torque = act(params, state, observation)
+        return state, torque, info
+
+    return Controller(init=init, plan=plan, act=act, step=step)
+
+
+def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) -> ControllerParams:
+    """Fit the Koopman models, condense the LMPC and gather everything that ``plan`` needs.
+
+    The work is done in float64 whatever the caller's default; the result is cast once.
+
+    Args:
+      config: of the run.
+      robot: e.g. ``kjax.robots.go1.PARAMS``.
+      dtype: floating type of the result; JAX's current default if ``None``.
+    """
+    dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    gaits = {"trot": gait.trot(config.gait.stance_time), "stand": gait.stand()}
+    leg = config.leg
+    with jax.enable_x64(True):
+        body = srb_params(config.srb)
+        model, report = _fit_modes(body, config=config.koopman)
+        if not bool(report.finite.all()):
+            raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
+        params = ControllerParams(
+            robot=robot,
+            tables=_build_tables(
+                model,
+                config=config.lmpc,
+                data_dt=config.koopman.dataset.dt,
+                mass=config.srb.mass,
+                feet=body.feet,
+            ),
+            schedule=gait.build_schedule(list(gaits.values())),
+            gait=jnp.asarray(list(gaits).index(config.gait.name)),
+            swing=swing.SwingParams(
+                apex=jnp.asarray(leg.apex),
+                horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
+                velocity_gain=jnp.asarray(leg.velocity_gain),
+                hold_after=jnp.asarray(leg.hold_after),
+                kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
+                kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
+            ),
+            command=Command(
+                times=jnp.asarray(config.command.times),
+                velocities=jnp.asarray(config.command.velocities),
+            ),
+            height=jnp.asarray(config.lmpc.height),
+            position_slack=jnp.asarray(config.lmpc.position_slack),
+        )
+        params = jax.device_get(params)
+    return jax.tree.map(lambda leaf: _as(leaf, dtype), params)
+
+
+_fit_modes = jax.jit(fit_modes, static_argnames="config")
+_build_tables = jax.jit(build_tables, static_argnames=("config", "data_dt", "mass"))
+
+
+def _as(leaf: Any, dtype: Any) -> Array:
+    """Leaf on the device: floats in ``dtype``, integers as int32, the rest as it is."""
+    kind = jnp.asarray(leaf).dtype
+    if jnp.issubdtype(kind, jnp.floating):
+        return jnp.asarray(leaf, dtype)
+    return jnp.asarray(leaf, jnp.int32) if jnp.issubdtype(kind, jnp.integer) else jnp.asarray(leaf)
+
+
+def _cast(observation: Observation, params: ControllerParams) -> Observation:
+    """Observation in the controller's floating type."""
+    dtype = params.height.dtype
+    floats = [jnp.asarray(leaf, dtype) for leaf in observation[:-1]]
+    return Observation(*floats, contact=jnp.asarray(observation.contact, bool))
+
+
+def _all_finite(observation: Observation) -> Array:
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in observation[:-1]]).all()
+
+
+def _stand_in(observation: Observation, readable: Array, params: ControllerParams) -> Observation:
+    """The observation, or a harmless one where it is not finite, so that no NaN spreads."""
+    harmless = Observation(
+        base_pos=jnp.array([0.0, 0.0, 1.0]) * params.height,
+        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
+        base_vel=jnp.zeros(3),
+        base_ang_vel=jnp.zeros(3),
+        joint_pos=jnp.tile(jnp.array([0.0, 0.9, -1.8]), (4, 1)),
+        joint_vel=jnp.zeros((4, 3)),
+        contact=observation.contact,
+    )
+    return jax.tree.map(
+        lambda seen, safe: jnp.where(readable, seen, safe.astype(seen.dtype)),
+        observation,
+        harmless,
+    )
+
+
+def _command_at(command: Command, time: Float[Array, ""]) -> Float[Array, ""]:
+    """Velocity commanded at ``time``; a piece begins at its start time, to within rounding."""
+    index = jnp.sum(time >= command.times - 1e-5) - 1
+    return command.velocities[jnp.maximum(index, 0)]
+
+
+def _contact_points(
+    robot: RobotParams, body: PlanarState, stance: Bool[Array, "4"]
+) -> Float[Array, "2 2"]:
+    """Mean contact point (x, z) of the stance feet at each end, body frame from the CoM [m].
+
+    An end without a stance foot gets its swing feet, which no force acts on.
+    """
+    ground = body.feet - jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+    local = (ground - body.x[:2]) @ body.rotation
+    ends = local.reshape(2, 2, 2)
+    weight = stance.reshape(2, 2).astype(local.dtype)
+    weight = jnp.where(weight.sum(axis=1, keepdims=True) > 0, weight, 1.0)
+    return (ends * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]

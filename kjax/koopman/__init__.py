@@ -1,0 +1,1 @@
+"""Koopman models: dictionaries, data, EDMD, predictors, validation."""

@@ -1,0 +1,1 @@
+"""Legs: kinematics, swing and stance."""

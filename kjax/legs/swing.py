@@ -1,0 +1,189 @@
+"""Swing legs: Raibert footholds, the foot's path, and the joint PD that follows it."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from kjax.legs.kinematics import PlanarState, foot_jacobian, inverse
+from kjax.types import RobotParams
+
+MAX_JOINT_RATE = 20.0  # rad/s; below the Go1's 30, bounds the reference near singular legs
+
+
+class SwingParams(NamedTuple):
+    """Swing settings; data, so they may differ between the robots of a batch.
+
+    Attributes:
+      apex: height above the higher of lift-off and target [m].
+      horizontal_fraction: part of the swing after which the foot is above its foothold [-].
+      velocity_gain: foothold gain on the velocity error [s].
+      hold_after: part of the swing after which a contact means an obstacle [-].
+      kp: joint stiffness of (abduction, thigh, calf) [N m/rad].
+      kd: joint damping of the same [N m s/rad].
+    """
+
+    apex: Float[Array, ""]
+    horizontal_fraction: Float[Array, ""]
+    velocity_gain: Float[Array, ""]
+    hold_after: Float[Array, ""]
+    kp: Float[Array, "3"]
+    kd: Float[Array, "3"]
+
+
+class SwingState(NamedTuple):
+    """What a swing remembers.
+
+    Attributes:
+      lift_off: (4, 2) where the foot left the ground, world [m].
+      elapsed: (4,) time since then [s].
+      duration: (4,) planned length of the swing [s].
+      held: (4,) whether an early contact stopped the foot.
+      held_at: (4, 2) where it did, world [m].
+    """
+
+    lift_off: Float[Array, "4 2"]
+    elapsed: Float[Array, "4"]
+    duration: Float[Array, "4"]
+    held: Bool[Array, "4"]
+    held_at: Float[Array, "4 2"]
+
+
+def initial_swing(feet: Float[Array, "4 2"]) -> SwingState:
+    """State before the first swing, feet (4, 2) in the world [m]."""
+    zeros = jnp.zeros((4,), feet.dtype)
+    return SwingState(
+        lift_off=feet, elapsed=zeros, duration=zeros + 1.0, held=zeros > 1.0, held_at=feet
+    )
+
+
+def begin_swings(
+    state: SwingState,
+    lifting: Bool[Array, "4"],
+    feet: Float[Array, "4 2"],
+    duration: Float[Array, "4"],
+) -> SwingState:
+    """State with new swings of ``duration`` [s] for the legs that are ``lifting`` off now."""
+    return SwingState(
+        lift_off=jnp.where(lifting[:, None], feet, state.lift_off),
+        elapsed=jnp.where(lifting, 0.0, state.elapsed),
+        duration=jnp.where(lifting, duration, state.duration),
+        held=state.held & ~lifting,
+        held_at=state.held_at,
+    )
+
+
+def continue_swings(
+    params: SwingParams,
+    state: SwingState,
+    swinging: Bool[Array, "4"],
+    contact: Bool[Array, "4"],
+    feet: Float[Array, "4 2"],
+    dt: float,
+) -> SwingState:
+    """State ``dt`` [s] later; a foot that hits something late in its swing is held where it is."""
+    elapsed = jnp.where(swinging, state.elapsed + dt, state.elapsed)
+    late = elapsed > params.hold_after * state.duration
+    caught = swinging & contact & late & ~state.held
+    return state._replace(
+        elapsed=elapsed,
+        held=state.held | caught,
+        held_at=jnp.where(caught[:, None], feet, state.held_at),
+    )
+
+
+def foothold(
+    robot: RobotParams,
+    params: SwingParams,
+    body: PlanarState,
+    remaining: Float[Array, "4"],
+    stance_time: Float[Array, "4"],
+    velocity_command: Float[Array, ""],
+) -> Float[Array, "4"]:
+    """World x of each leg's next foothold [m]: Raibert's law.
+
+    The hip's place at touchdown, half a stance further, and a correction of the velocity error.
+
+    Args:
+      robot: hip positions.
+      params: swing settings.
+      body: sagittal state.
+      remaining: (4,) time to touchdown [s].
+      stance_time: (4,) length of the stance to come [s].
+      velocity_command: commanded forward velocity [m/s].
+    """
+    v = body.x[3]
+    hips = body.base[0] + robot.hip_pos[:, ::2] @ body.rotation[0]
+    return (
+        hips + v * (remaining + 0.5 * stance_time) + params.velocity_gain * (v - velocity_command)
+    )
+
+
+def foot_reference(
+    params: SwingParams, state: SwingState, target: Float[Array, "4 2"]
+) -> tuple[Float[Array, "4 2"], Float[Array, "4 2"]]:
+    """Position [m] and velocity [m/s] (4, 2) of the swing feet, world frame.
+
+    Horizontally a smoothstep that ends at ``horizontal_fraction``; vertically one up to the apex
+    in the first half and one down to the target in the second.
+    """
+    duration = state.duration
+    phase = jnp.clip(state.elapsed / duration, 0.0, 1.0)
+
+    across = jnp.minimum(phase / params.horizontal_fraction, 1.0)
+    shift, shift_rate = _smoothstep(across)
+    shift_rate = shift_rate / (params.horizontal_fraction * duration)
+    x = state.lift_off[:, 0] + (target[:, 0] - state.lift_off[:, 0]) * shift
+    v_x = (target[:, 0] - state.lift_off[:, 0]) * shift_rate
+
+    top = jnp.maximum(state.lift_off[:, 1], target[:, 1]) + params.apex
+    rising = phase < 0.5
+    low = jnp.where(rising, state.lift_off[:, 1], top)
+    high = jnp.where(rising, top, target[:, 1])
+    climb, climb_rate = _smoothstep(jnp.where(rising, 2.0 * phase, 2.0 * phase - 1.0))
+    z = low + (high - low) * climb
+    v_z = (high - low) * climb_rate * 2.0 / duration
+
+    position = jnp.stack([x, z], axis=-1)
+    velocity = jnp.stack([v_x, v_z], axis=-1)
+    held = state.held[:, None]
+    return jnp.where(held, state.held_at, position), jnp.where(held, 0.0, velocity)
+
+
+def _smoothstep(s: Array) -> tuple[Array, Array]:
+    """3 s^2 - 2 s^3 and its derivative, for s in [0, 1]."""
+    return s * s * (3.0 - 2.0 * s), 6.0 * s * (1.0 - s)
+
+
+def joint_reference(
+    robot: RobotParams,
+    body: PlanarState,
+    position: Float[Array, "4 2"],
+    velocity: Float[Array, "4 2"],
+) -> tuple[Float[Array, "4 2"], Float[Array, "4 2"]]:
+    """Thigh and calf angle [rad] and rate [rad/s] (4, 2) for foot references in the world."""
+    local = (position - body.base) @ body.rotation  # R^T (p - base): body frame
+    drift = (velocity - body.base_vel) @ body.rotation
+    # The trunk's own turning moves a point that is fixed in the world by -omega x r.
+    drift = drift - body.omega * jnp.stack([-local[:, 1], local[:, 0]], axis=-1)
+    q1, q2, trig = inverse(robot, local - robot.hip_pos[:, ::2])
+    J = foot_jacobian(robot, trig)
+    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+    safe = jnp.where(jnp.abs(det) > 5e-3, det, jnp.inf)
+    rate1 = (J[:, 1, 1] * drift[:, 0] - J[:, 0, 1] * drift[:, 1]) / safe
+    rate2 = (J[:, 0, 0] * drift[:, 1] - J[:, 1, 0] * drift[:, 0]) / safe
+    rates = jnp.clip(jnp.stack([rate1, rate2], axis=-1), -MAX_JOINT_RATE, MAX_JOINT_RATE)
+    return jnp.stack([q1, q2], axis=-1), rates
+
+
+def swing_torque(
+    params: SwingParams,
+    joint_pos: Float[Array, "4 3"],
+    joint_vel: Float[Array, "4 3"],
+    position: Float[Array, "4 2"],
+    velocity: Float[Array, "4 2"],
+) -> Float[Array, "4 2"]:
+    """Thigh and calf torque (4, 2) of the joint PD (the paper's swing controller) [N m]."""
+    return params.kp[1:] * (position - joint_pos[:, 1:]) + params.kd[1:] * (
+        velocity - joint_vel[:, 1:]
+    )

@@ -1,0 +1,1 @@
+"""Linear model predictive control on Koopman models."""

@@ -1,0 +1,1 @@
+"""Robots: constants for the controller, and their MJCF."""

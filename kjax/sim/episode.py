@@ -1,0 +1,176 @@
+"""What an episode starts from and what it leaves: initial state, noise, trajectory, metrics."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kjax import qp
+from kjax.config import RunConfig
+from kjax.legs.kinematics import planar_state
+from kjax.robots import go1
+from kjax.sim.observe import NOISE_DIM, Observe, noise_scale
+
+FALL_HEIGHT = 0.12  # m, centre of mass; about the trunk lying on the ground
+FALL_PITCH = 1.0  # rad
+SETTLE_TIME = 0.5  # s; metrics leave out the start from standing
+
+
+@dataclass(kw_only=True)
+class Trajectory:
+    """One robot's episode; arrays at the physics rate (N,) unless said otherwise.
+
+    Attributes:
+      time: [s].
+      qpos: (N, nq) positions of the model.
+      qvel: (N, nv) velocities of the model.
+      x: (N, 6) true SRB state of the whole-body centre of mass [m, rad, m/s, rad/s].
+      feet: (N, 4, 2) foot centres (x, z), world [m].
+      foot_force: (N, 4) normal force on the contact sensors [N].
+      torque: (N, 4, 3) joint torques commanded (abduction, thigh, calf) [N m].
+      stance: (N, 4) scheduled stance.
+      force: (N, 4, 2) planned force on each leg, body frame [N].
+      velocity_command: (N,) [m/s].
+      plan_status: (P,) ``qp.Status`` of each plan.
+      plan_residual: (P,) KKT residual [-].
+      plan_iterations: (P,) solver iterations.
+      plan_time: (P,) wall time of each call [s].
+      act_time: (N,) wall time of each call [s].
+      wall_time: of the whole loop [s].
+      fell: whether the robot fell (the episode ends there).
+      interrupted: whether the user stopped the run.
+    """
+
+    time: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    x: np.ndarray
+    feet: np.ndarray
+    foot_force: np.ndarray
+    torque: np.ndarray
+    stance: np.ndarray
+    force: np.ndarray
+    velocity_command: np.ndarray
+    plan_status: np.ndarray
+    plan_residual: np.ndarray
+    plan_iterations: np.ndarray
+    plan_time: np.ndarray
+    act_time: np.ndarray
+    wall_time: float
+    fell: bool
+    interrupted: bool
+
+    def save(self, path: Path) -> None:
+        """Write everything to a compressed ``.npz``."""
+        np.savez_compressed(path, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> "Trajectory":
+        """Read what ``save`` wrote."""
+        with np.load(path) as data:
+            values: dict[str, Any] = {f.name: data[f.name] for f in fields(cls)}
+        for name, kind in (("wall_time", float), ("fell", bool), ("interrupted", bool)):
+            values[name] = kind(values[name])
+        return cls(**values)
+
+
+def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
+    """Qpos and qvel of the planar robot, standing, disturbed as the config and its seed say."""
+    height, joints = go1.stand_pose(config.lmpc.height)
+    qpos, qvel = np.zeros(nq), np.zeros(nv)
+    qpos[1], qpos[3:] = height, joints.reshape(-1)
+    spread, noise = config.noise, np.random.default_rng([config.seed, 0])
+    if spread.enabled:
+        pitch = spread.initial_pitch * noise.standard_normal()
+        qpos[2] = -pitch
+        # Keep the lower pair of feet on the ground rather than in it.
+        qpos[1] += abs(np.sin(pitch)) * go1.PARAMS.hip_pos[0, 0]
+        qvel[:2] = spread.initial_velocity * noise.standard_normal(2)
+        qvel[2] = -spread.initial_pitch_rate * noise.standard_normal()
+    return qpos, qvel
+
+
+def sensor_noise(config: RunConfig, steps: int) -> np.ndarray:
+    """Noise (steps, 30) of an episode; entry i depends on the seed and i only."""
+    scale = noise_scale(config.noise)
+    if not scale.any():
+        return np.zeros((steps, NOISE_DIM))
+    key = jax.random.fold_in(jax.random.key(config.seed), 1)
+
+    def one(i: jax.Array) -> jax.Array:
+        return jax.random.normal(jax.random.fold_in(key, i), (NOISE_DIM,), jnp.float32)
+
+    return np.asarray(jax.jit(jax.vmap(one))(jnp.arange(steps)), float) * scale
+
+
+def sagittal(observe: Observe, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """True SRB states (N, 6) and feet (N, 4, 2) along a trajectory, without noise."""
+
+    def one(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        body = planar_state(go1.PARAMS, observe(qpos, qvel, jnp.zeros(64)))
+        return body.x, body.feet
+
+    x, feet = jax.jit(jax.vmap(one))(qpos, qvel)
+    return np.asarray(x), np.asarray(feet)
+
+
+def fallen(height: float, pitch: float) -> bool:
+    """Whether a centre-of-mass height [m] and a pitch [rad] mean a fall; NaN does."""
+    return not (height > FALL_HEIGHT and abs(pitch) < FALL_PITCH)
+
+
+def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
+    """Flat metrics of an episode, the unit in the key."""
+    steady = run.time >= SETTLE_TIME
+    result: dict[str, Any] = {
+        "fell": run.fell,
+        "fall_time_s": float(run.time[-1]) if run.fell else None,
+        "interrupted": run.interrupted,
+        "simulated_s": float(len(run.time) * config.sim.sim_dt),
+    }
+    if not steady.any():
+        return result
+    error = run.x[steady, 3] - run.velocity_command[steady]
+    pitch = np.degrees(np.abs(run.x[steady, 2]))
+    height = run.x[steady, 1]
+    limit = go1.PARAMS.torque_limit
+    saturated = np.abs(run.torque) >= 0.999 * limit
+    unsolved = run.plan_status != qp.Status.SOLVED
+    result |= {
+        "velocity_rmse_mps": float(np.sqrt(np.mean(error**2))),
+        "pitch_max_deg": float(pitch.max()),
+        "pitch_p95_deg": float(np.percentile(pitch, 95)),
+        "height_mean_m": float(height.mean()),
+        "height_min_m": float(height.min()),
+        "height_max_m": float(height.max()),
+        "distance_m": float(run.x[-1, 0] - run.x[0, 0]),
+        "foot_slip_m": foot_slip(run, config.sim.sim_dt, config.sim.contact_threshold),
+        "torque_max_nm": float(np.abs(run.torque).max()),
+        "torque_saturation_fraction": float(saturated.any(axis=(1, 2)).mean()),
+        "qp_unsolved": int(unsolved.sum()),
+        "qp_iterations_median": float(np.median(run.plan_iterations)),
+        "plan_ms_median": float(1e3 * np.median(run.plan_time)),
+        "plan_ms_p99": float(1e3 * np.percentile(run.plan_time, 99)),
+        "act_ms_median": float(1e3 * np.median(run.act_time)),
+        "act_ms_p99": float(1e3 * np.percentile(run.act_time, 99)),
+        "realtime_factor": float(len(run.time) * config.sim.sim_dt / run.wall_time),
+    }
+    return result
+
+
+def foot_slip(run: Trajectory, dt: float, threshold: float) -> float:
+    """Mean path that a foot's contact point slides along the ground per stance [m].
+
+    The foot is a sphere: while the calf turns, its centre moves without slip. What counts is the
+    velocity of the material point at the bottom, v_centre - (d angle / dt) * radius.
+    """
+    joints = run.qpos[:, 3:].reshape(-1, 4, 3)
+    angle = run.qpos[:, 2, None] + joints[:, :, 1] + joints[:, :, 2]  # of the calf, about +y
+    slide = np.diff(run.feet[:, :, 0], axis=0) - go1.FOOT_RADIUS * np.diff(angle, axis=0)
+    touching = run.foot_force > threshold
+    pressed = touching[:-1] & touching[1:]
+    stances = np.sum(np.diff(run.stance.astype(int), axis=0) > 0) + run.stance[0].sum()
+    return float(np.abs(slide[pressed]).sum() / max(stances, 1))

@@ -1,0 +1,236 @@
+"""One robot in C MuJoCo: the physics steps in C, the controller in two jitted calls."""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array
+
+from kjax.config import RunConfig
+from kjax.controller import (
+    Controller,
+    ControllerParams,
+    ControllerState,
+    build_controller,
+    build_params,
+)
+from kjax.robots import go1
+from kjax.sim.episode import Trajectory, fallen, initial_state, sagittal, sensor_noise
+from kjax.sim.observe import NOISE_DIM, Addresses, Observe, add_noise, build_observe, resolve
+from kjax.sim.scene import build_model
+from kjax.types import Observation
+
+# Called once per control tick with the steps done, the steps in all and the data; return value
+# ignored. For progress bars and viewers.
+OnTick = Callable[[int, int, mujoco.MjData], None]
+
+
+class TickLog(NamedTuple):
+    """What is recorded at the MPC rate."""
+
+    stance: Array
+    force: Array
+    velocity_command: Array
+    status: Array
+    residual: Array
+    iterations: Array
+
+
+class Simulation(NamedTuple):
+    """Everything compiled and built for one config; reusable over seeds.
+
+    The jitted calls take one flat vector of sensor values (qpos, qvel, sensordata, noise) and keep
+    the controller state in another: passing pytrees costs 2 us per leaf and call, more than the
+    controller itself.
+
+    Attributes:
+      config: it was built from.
+      model: MuJoCo model.
+      addresses: of joints, actuators, sensors.
+      observe: (qpos, qvel, sensordata) -> observation.
+      controller: pure functions.
+      params: controller numbers.
+      init: jitted (sensed,) -> state.
+      plan: jitted (state, sensed) -> (state, log).
+      act: jitted (state, sensed) -> (state, torque (12,) in leg order).
+      unpack_log: log vectors (P, n) -> ``TickLog`` of arrays with a leading axis P.
+    """
+
+    config: RunConfig
+    model: mujoco.MjModel
+    addresses: Addresses
+    observe: Observe
+    controller: Controller
+    params: ControllerParams
+    init: Callable[[Array], Array]
+    plan: Callable[[Array, Array], tuple[Array, Array]]
+    act: Callable[[Array, Array], tuple[Array, Array]]
+    unpack_log: Callable[[np.ndarray], TickLog]
+
+
+def build_simulation(config: RunConfig) -> Simulation:
+    """Model, controller and compiled calls for a config."""
+    model = build_model(config.sim)
+    observe = build_observe(model, config.sim.contact_threshold)
+    controller, params = build_controller(config), build_params(config, go1.PARAMS)
+    cuts = np.cumsum([model.nq, model.nv, model.nsensordata])
+
+    def sense(sensed: Array) -> Observation:
+        qpos, qvel, sensordata, noise = jnp.split(sensed, cuts)
+        return add_noise(observe(qpos, qvel, sensordata), noise)
+
+    def pack(tree: ControllerState | TickLog) -> Array:
+        return jnp.concatenate([jnp.ravel(a).astype(dtype) for a in jax.tree.leaves(tree)])
+
+    def unpack(flat: Array, like: Any) -> Any:
+        leaves, shape = jax.tree.flatten(like)
+        parts = jnp.split(flat, np.cumsum([leaf.size for leaf in leaves])[:-1])
+        return jax.tree.unflatten(
+            shape,
+            [
+                part.reshape(leaf.shape).astype(leaf.dtype)
+                for part, leaf in zip(parts, leaves, strict=True)
+            ],
+        )
+
+    def plan_log(state: ControllerState, sensed: Array) -> tuple[ControllerState, TickLog]:
+        state, info = controller.plan(params, state, sense(sensed))
+        log = TickLog(
+            stance=state.stance,
+            force=state.force,
+            velocity_command=state.velocity_command,
+            status=info.status,
+            residual=info.residual,
+            iterations=info.iterations,
+        )
+        return state, log
+
+    def init(sensed: Array) -> Array:
+        return pack(controller.init(params, sense(sensed)))
+
+    def plan(flat: Array, sensed: Array) -> tuple[Array, Array]:
+        state, log = plan_log(unpack(flat, state_like), sensed)
+        return pack(state), pack(log)
+
+    def act(flat: Array, sensed: Array) -> tuple[Array, Array]:
+        state, torque = controller.act(params, unpack(flat, state_like), sense(sensed))
+        return pack(state), torque.reshape(-1)
+
+    dtype = params.height.dtype
+    example = jax.ShapeDtypeStruct((cuts[-1] + NOISE_DIM,), dtype)
+    state_like = jax.eval_shape(lambda sensed: controller.init(params, sense(sensed)), example)
+    _, log_like = jax.eval_shape(plan_log, state_like, example)
+    return Simulation(
+        config=config,
+        model=model,
+        addresses=resolve(model),
+        observe=observe,
+        controller=controller,
+        params=params,
+        init=jax.jit(init),
+        plan=jax.jit(plan),
+        act=jax.jit(act),
+        unpack_log=lambda flat: jax.device_get(jax.vmap(lambda one: unpack(one, log_like))(flat)),
+    )
+
+
+def simulate(
+    simulation: Simulation, *, seed: int | None = None, on_tick: OnTick | None = None
+) -> Trajectory:
+    """One episode. It ends at the config's duration, at a fall, or at Ctrl-C (and then returns).
+
+    Args:
+      simulation: from ``build_simulation``.
+      seed: in place of the config's.
+      on_tick: called once per control tick.
+    """
+    config = simulation.config
+    if seed is not None:
+        config = type(config)(**{**vars(config), "seed": seed})
+    model, at = simulation.model, simulation.addresses
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+    mujoco.mj_forward(model, data)
+
+    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    ticks = -(-round(config.duration / config.sim.sim_dt) // per_tick)
+    steps = ticks * per_tick
+    noise = sensor_noise(config, steps)
+    sensed = np.zeros(model.nq + model.nv + model.nsensordata + NOISE_DIM)
+    cuts = np.cumsum([model.nq, model.nv, model.nsensordata])
+
+    def sense(step: int) -> np.ndarray:
+        sensed[: cuts[0]] = data.qpos
+        sensed[cuts[0] : cuts[1]] = data.qvel
+        sensed[cuts[1] : cuts[2]] = data.sensordata
+        sensed[cuts[2] :] = noise[step]
+        return sensed
+
+    qpos, qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
+    torque, foot_force = np.zeros((steps, 12)), np.zeros((steps, 4))
+    plan_time, act_time = np.zeros(ticks), np.zeros(steps)
+    logs: list[np.ndarray] = []
+    actuators, trunk = at.actuator.reshape(-1), model.body("trunk").id
+
+    state = simulation.init(sense(0))
+    # Compile outside the timed loop; the results are dropped.
+    jax.block_until_ready((simulation.plan(state, sensed), simulation.act(state, sensed)))
+
+    fell = interrupted = False
+    done = 0
+    begin = time.perf_counter()
+    try:
+        for tick in range(ticks):
+            sense(tick * per_tick)
+            clock = time.perf_counter()
+            state, log = simulation.plan(state, sensed)
+            logs.append(np.asarray(log))
+            plan_time[tick] = time.perf_counter() - clock
+            for i in range(tick * per_tick, (tick + 1) * per_tick):
+                qpos[i], qvel[i] = data.qpos, data.qvel
+                foot_force[i] = data.sensordata[at.foot_force]
+                sense(i)
+                clock = time.perf_counter()
+                state, command = simulation.act(state, sensed)
+                torque[i] = command
+                act_time[i] = time.perf_counter() - clock
+                data.ctrl[actuators] = torque[i]
+                mujoco.mj_step(model, data)
+                done = i + 1
+            if fallen(data.subtree_com[trunk, 2], data.qpos[2]):
+                fell = True
+                break
+            if on_tick is not None:
+                on_tick(done, steps, data)
+    except KeyboardInterrupt:
+        interrupted = True
+    wall = time.perf_counter() - begin
+
+    keep = slice(0, done)
+    x, feet = sagittal(simulation.observe, qpos[keep], qvel[keep])
+    log = simulation.unpack_log(np.stack(logs))
+    held = np.arange(done) // per_tick
+    return Trajectory(
+        time=np.arange(done) * config.sim.sim_dt,
+        qpos=qpos[keep],
+        qvel=qvel[keep],
+        x=x,
+        feet=feet,
+        foot_force=foot_force[keep],
+        torque=torque[keep].reshape(-1, 4, 3),
+        stance=log.stance[held],
+        force=log.force[held],
+        velocity_command=log.velocity_command[held],
+        plan_status=log.status,
+        plan_residual=log.residual,
+        plan_iterations=log.iterations,
+        plan_time=plan_time[: len(log.status)],
+        act_time=act_time[keep],
+        wall_time=wall,
+        fell=fell,
+        interrupted=interrupted,
+    )

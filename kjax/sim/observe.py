@@ -1,0 +1,119 @@
+"""From an engine's arrays to an ``Observation``: the only place with addresses and signs.
+
+It reads ``qpos``, ``qvel`` and ``sensordata`` only, so the same function serves ``MjData`` and
+``mjx.Data``, one robot or, under ``vmap``, many.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from kjax.config import NoiseConfig
+from kjax.robots.go1 import JOINTS
+from kjax.types import Leg, Observation
+
+Observe = Callable[[Array, Array, Array], Observation]
+
+
+class Addresses(NamedTuple):
+    """Where the model keeps what the controller needs, resolved by name.
+
+    Attributes:
+      qpos: (4, 3) position address of each joint, leg order.
+      qvel: (4, 3) velocity address.
+      actuator: (4, 3) actuator index.
+      foot_force: (4,) address of each foot's touch sensor.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    actuator: np.ndarray
+    foot_force: np.ndarray
+
+
+def resolve(model: mujoco.MjModel) -> Addresses:
+    """Addresses of joints, actuators and sensors by name.
+
+    Raises:
+      ValueError: naming the joint, actuator or sensor that the model lacks.
+    """
+
+    def find(kind: mujoco.mjtObj, name: str) -> int:
+        index = mujoco.mj_name2id(model, kind, name)
+        if index < 0:
+            raise ValueError(f"the model has no {kind.name.removeprefix('mjOBJ_')} named '{name}'")
+        return index
+
+    names = [[f"{leg.name}_{joint}" for joint in JOINTS] for leg in Leg]
+    joints = np.array([[find(mujoco.mjtObj.mjOBJ_JOINT, n) for n in row] for row in names])
+    actuators = [[find(mujoco.mjtObj.mjOBJ_ACTUATOR, n) for n in row] for row in names]
+    sensors = [find(mujoco.mjtObj.mjOBJ_SENSOR, f"{leg.name}_foot") for leg in Leg]
+    return Addresses(
+        qpos=model.jnt_qposadr[joints],
+        qvel=model.jnt_dofadr[joints],
+        actuator=np.array(actuators),
+        foot_force=model.sensor_adr[sensors],
+    )
+
+
+def build_observe(model: mujoco.MjModel, contact_threshold: float) -> Observe:
+    """Function (qpos, qvel, sensordata) -> Observation for a planar-base model.
+
+    Args:
+      model: from ``sim.scene``.
+      contact_threshold: foot force above which a contact counts [N].
+    """
+    at = resolve(model)
+
+    def observe(qpos: Array, qvel: Array, sensordata: Array) -> Observation:
+        zero = jnp.zeros_like(qpos[0])
+        half = 0.5 * qpos[2]  # MuJoCo's angle about +y, nose-down positive
+        return Observation(
+            base_pos=jnp.stack([qpos[0], zero, qpos[1]]),
+            base_quat=jnp.stack([jnp.cos(half), zero, jnp.sin(half), zero]),
+            base_vel=jnp.stack([qvel[0], zero, qvel[1]]),
+            base_ang_vel=jnp.stack([zero, qvel[2], zero]),
+            joint_pos=qpos[at.qpos],
+            joint_vel=qvel[at.qvel],
+            contact=sensordata[at.foot_force] > contact_threshold,
+        )
+
+    return observe
+
+
+NOISE_DIM = 30  # planar: x, z, pitch; their rates; 12 joint angles; 12 joint rates
+
+
+def noise_scale(config: NoiseConfig) -> Float[np.ndarray, "noise"]:
+    """Standard deviation of each entry of the noise vector (zero where noise is off)."""
+    scale = np.concatenate(
+        [
+            [config.position, config.position, config.pitch],
+            [config.velocity, config.velocity, config.pitch_rate],
+            np.full(12, config.joint_position),
+            np.full(12, config.joint_velocity),
+        ]
+    )
+    return scale * config.enabled
+
+
+def add_noise(observation: Observation, noise: Float[Array, "noise"]) -> Observation:
+    """Observation with a noise vector added, in the sagittal plane; zero noise changes nothing."""
+    x, z, pitch, v_x, v_z, rate = noise[:6]
+    w, _, y, _ = observation.base_quat
+    # Nose-up by ``pitch``: a turn about y by -pitch, to first order, then normalised.
+    w, y = w + 0.5 * pitch * y, y - 0.5 * pitch * w
+    norm = jnp.sqrt(w * w + y * y)
+    zero = jnp.zeros_like(w)
+    return observation._replace(
+        base_pos=observation.base_pos + jnp.stack([x, zero, z]),
+        base_quat=jnp.stack([w / norm, zero, y / norm, zero]),
+        base_vel=observation.base_vel + jnp.stack([v_x, zero, v_z]),
+        base_ang_vel=observation.base_ang_vel + jnp.stack([zero, -rate, zero]),
+        joint_pos=observation.joint_pos + noise[6:18].reshape(4, 3),
+        joint_vel=observation.joint_vel + noise[18:30].reshape(4, 3),
+    )

@@ -1,0 +1,100 @@
+"""The scene: robot, base, ground and physics options, assembled with MjSpec."""
+
+import mujoco
+import numpy as np
+
+from kjax.config import SimConfig
+from kjax.robots import go1
+
+_CONES = {
+    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+}
+
+
+def build_spec(config: SimConfig) -> mujoco.MjSpec:
+    """MjSpec of the Go1 on flat ground, open to further edits before ``compile``."""
+    spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
+    spec.option.timestep = config.sim_dt
+    spec.option.cone = _CONES[config.cone]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.iterations = 30
+    for joint in spec.joints:
+        joint.damping[0] = config.joint_damping
+        joint.armature = config.joint_armature
+    for geom in spec.geoms:
+        is_foot = geom.name.endswith("_foot")
+        if is_foot:
+            geom.friction[0] = config.friction
+        elif config.contacts == "feet":
+            geom.contype, geom.conaffinity = 0, 0
+    _add_base(spec)
+    _add_world(spec)
+    return spec
+
+
+def build_model(config: SimConfig) -> mujoco.MjModel:
+    """Compiled model of the Go1 on flat ground."""
+    return build_spec(config).compile()
+
+
+def _add_base(spec: mujoco.MjSpec, base: str = "planar") -> None:
+    """Joints of the trunk: two slides and a pitch hinge, or a free joint."""
+    trunk = spec.body("trunk")
+    if base == "free":
+        trunk.add_freejoint(name="root")
+        return
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    # MuJoCo's hinge about +y turns the nose down; sim.observe flips the sign.
+    for name, kind, axis in (
+        ("root_x", slide, [1, 0, 0]),
+        ("root_z", slide, [0, 0, 1]),
+        ("root_pitch", hinge, [0, 1, 0]),
+    ):
+        trunk.add_joint(name=name, type=kind, axis=axis, damping=[0, 0, 0], armature=0)
+
+
+def _add_world(spec: mujoco.MjSpec) -> None:
+    """Ground plane, light, sky and a camera that follows the robot from its right side."""
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.85, 0.90, 0.95],
+        rgb2=[1.0, 1.0, 1.0],
+        width=256,
+        height=256,
+    )
+    spec.add_texture(
+        name="tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.78, 0.80, 0.82],
+        rgb2=[0.86, 0.87, 0.88],
+        width=256,
+        height=256,
+    )
+    material = spec.add_material(name="ground", texrepeat=[4, 4], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    world = spec.worldbody
+    world.add_geom(
+        name="ground",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        contype=1,
+        conaffinity=0,
+        material="ground",
+    )
+    spec.body("trunk").add_light(
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -0.6, 3], dir=[0, 0.2, -1]
+    )
+    spec.body("trunk").add_camera(
+        name="side",
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
+        pos=[0.25, -1.45, 0.28],
+        xyaxes=[1, 0.12, 0, -0.02, 0.16, 1],
+    )
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 720
+    spec.stat.center = np.array([0.0, 0.0, 0.2])
+    spec.stat.extent = 1.0
