@@ -1,1 +1,222 @@
-"""Command line, output folders and provenance of the experiments."""
+"""Command line, output folders and provenance of the experiments.
+
+A user's mistake ends with exit code 2 and one line; nothing here is imported by the library.
+"""
+
+import argparse
+import difflib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tomllib
+import typing
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import jax
+import tomli_w
+
+from kjax.config import ConfigError, fields, load_config, to_dict
+
+T = TypeVar("T")
+
+_PACKAGES = ("kjax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
+
+
+def fail(message: str) -> NoReturn:
+    """Print one line to stderr and end with exit code 2."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+class _Parser(argparse.ArgumentParser):
+    """An ArgumentParser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        fail(message)
+
+
+def run(main: Callable[[], None]) -> None:
+    """Call an experiment's ``main``; Ctrl-C and a full disk end it without a traceback."""
+    try:
+        main()
+    except KeyboardInterrupt:
+        print("interrupted before there was anything to keep", file=sys.stderr)
+        raise SystemExit(130) from None
+    except OSError as error:
+        fail(f"{error.filename or 'output'}: {error.strerror or error}")
+
+
+def build_parser(cls: type, description: str) -> argparse.ArgumentParser:
+    """Parser with the config file, ``--out`` and one option per config key."""
+    parser = _Parser(
+        description=description,
+        allow_abbrev=False,
+        usage="%(prog)s [CONFIG.toml] [options] [--any.config.key VALUE ...]",
+    )
+    parser.add_argument("config", nargs="?", help="TOML file; without it, the defaults below")
+    parser.add_argument("--out", type=Path, help="output folder (default: results/CONFIG)")
+    sections: dict[str, Any] = {}
+    for name, info, default in fields(cls):
+        section = name.rsplit(".", 1)[0] if "." in name else "run"
+        if section not in sections:
+            sections[section] = parser.add_argument_group(f"config: {section}")
+        shown = list(default) if isinstance(default, tuple) else default
+        sections[section].add_argument(
+            f"--{name}",
+            dest=f"key:{name}",
+            metavar=_type_name(info.annotation),
+            help=f"{info.description} default: {shown}".replace("%", "%%"),
+        )
+    return parser
+
+
+def parse(
+    cls: type[T], parser: argparse.ArgumentParser, argv: Sequence[str] | None = None
+) -> tuple[T, argparse.Namespace]:
+    """Config and the other options from a command line; a mistake ends the program."""
+    known = [action.option_strings[0] for action in parser._actions if action.option_strings]
+    # A value such as -0.1 or [-1, 2] must not look like an option.
+    args, unknown = parser.parse_known_args(_join_values(sys.argv[1:] if argv is None else argv))
+    for word in unknown:
+        name = word.split("=")[0]
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        fail(f"unknown option {name}" + (f"; did you mean {near[0]}?" if near else ""))
+    overrides = {
+        key.removeprefix("key:"): _value(text)
+        for key, text in vars(args).items()
+        if key.startswith("key:") and text is not None
+    }
+    try:
+        return load_config(cls, args.config, overrides), args
+    except ConfigError as error:
+        fail(str(error))
+
+
+def _join_values(words: Sequence[str]) -> list[str]:
+    joined: list[str] = []
+    for word in words:
+        negative = word.startswith("-") and word[1:2] in "0123456789.i"
+        if negative and joined and joined[-1].startswith("--") and "=" not in joined[-1]:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def _value(text: str) -> Any:
+    """A command-line value read as TOML, or as a plain string where it is none."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _type_name(annotation: Any) -> str:
+    if typing.get_origin(annotation) is typing.Literal:
+        return "{" + ",".join(str(option) for option in typing.get_args(annotation)) + "}"
+    if typing.get_origin(annotation) is tuple:
+        return "LIST"
+    return getattr(annotation, "__name__", "VALUE").upper()
+
+
+def configure_jax(*, one_core: bool = False) -> None:
+    """JAX as the experiments want it: float64, compile cache on disk, synchronous dispatch.
+
+    Args:
+      one_core: bind the process to one core. A single robot's controller is many small kernels,
+        which waking a second thread only delays.
+    """
+    if one_core and hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[os.getpid() % len(cores)]})
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        jax.config.update("jax_compilation_cache_dir", str(home / "kjax" / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def output_folder(args: argparse.Namespace, default: str) -> Path:
+    """The folder to write to, made and probed; ends the program where it is not writable."""
+    name = Path(args.config).stem if args.config else default
+    folder: Path = args.out or Path("results") / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        fail(f"--out {folder}: cannot be written to: {error.strerror}")
+    return folder
+
+
+def provenance() -> dict[str, Any]:
+    """Versions, git revision and machine, for the record of a run."""
+    versions = {}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return {
+        "created": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "git_revision": _git_revision(),
+        "python": platform.python_version(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cpus",
+        "versions": versions,
+    }
+
+
+def _git_revision() -> str:
+    """Revision of the checkout that this package lies in, '+' where it has local changes."""
+    here = Path(__file__).resolve().parent
+    try:
+        return subprocess.run(
+            ["git", "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],
+            cwd=here,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=5,
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def save_config(path: Path, config: Any) -> None:
+    """Write the resolved config as TOML, with versions and revision in comments above it."""
+    record = provenance()
+    lines = [f"# {key}: {value}" for key, value in record.items() if key != "versions"]
+    lines += [f"# {name} {number}" for name, number in record["versions"].items()]
+    write_text(path, "\n".join(lines) + "\n\n" + tomli_w.dumps(to_dict(config)))
+
+
+def save_json(path: Path, data: Any) -> None:
+    """Write JSON; NaN and infinity become null, since JSON has neither."""
+    write_text(path, json.dumps(_plain(data), indent=1, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    scratch = path.with_name(path.name + ".part")
+    scratch.write_text(text, encoding="utf-8")
+    scratch.replace(path)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not (-1e308 < value < 1e308):
+        return None
+    return value

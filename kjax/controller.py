@@ -322,8 +322,8 @@ def _as(leaf: Any, dtype: Any) -> Array:
 def _cast(observation: Observation, params: ControllerParams) -> Observation:
     """Observation in the controller's floating type."""
     dtype = params.height.dtype
-    floats = [jnp.asarray(leaf, dtype) for leaf in observation[:-1]]
-    return Observation(*floats, contact=jnp.asarray(observation.contact, bool))
+    floats = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), observation)
+    return floats._replace(contact=jnp.asarray(observation.contact, bool))
 
 
 def _all_finite(observation: Observation) -> Array:

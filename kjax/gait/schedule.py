@@ -26,7 +26,7 @@ class Schedule(NamedTuple):
     """Stacked gaits (G gaits, P phases, padding repeats phase 0 and is never entered).
 
     Attributes:
-      count: (G,) number of phases of the gait.
+      phases: (G,) number of phases of the gait.
       duration: (G, P) duration of the phase [s].
       mode: (G, P) contact mode.
       stance: (G, P, 4) whether the leg stands.
@@ -35,7 +35,7 @@ class Schedule(NamedTuple):
       stance_time: (G, P, 4) length of the leg's current or next stance [s].
     """
 
-    count: Int[Array, "G"]
+    phases: Int[Array, "G"]
     duration: Float[Array, "G P"]
     mode: Int[Array, "G P"]
     stance: Bool[Array, "G P 4"]
@@ -81,7 +81,7 @@ def build_schedule(gaits: list[list[Phase]]) -> Schedule:
     rows = [[_timing(gait, min(i, len(gait) - 1)) for i in range(padded)] for gait in gaits]
     phases = [[gait[min(i, len(gait) - 1)] for i in range(padded)] for gait in gaits]
     return Schedule(
-        count=jnp.asarray([len(gait) for gait in gaits]),
+        phases=jnp.asarray([len(gait) for gait in gaits]),
         duration=jnp.asarray([[p.duration for p in row] for row in phases]),
         mode=jnp.asarray([[int(p.mode) for p in row] for row in phases]),
         stance=jnp.asarray([[p.stance for p in row] for row in phases]),
@@ -137,7 +137,7 @@ def advance(schedule: Schedule, clock: Clock, dt: float) -> Clock:
     elapsed = clock.elapsed + dt
     done = elapsed >= duration - 0.5 * dt
     following = clock.phase + 1
-    following = jnp.where(following >= schedule.count[clock.gait], 0, following)
+    following = jnp.where(following >= schedule.phases[clock.gait], 0, following)
     return Clock(
         gait=clock.gait,
         phase=jnp.where(done, following, clock.phase).astype(clock.phase.dtype),

@@ -82,9 +82,7 @@ def build_tables(
     )
 
 
-def force_bounds(
-    config: LmpcConfig, mass: float
-) -> tuple[Float[Array, "M 4"], Float[Array, "M 4"], Float[Array, "M 4"]]:
+def force_bounds(config: LmpcConfig, mass: float) -> tuple[Float[Array, "M 4"], ...]:
     """Lower bound, upper bound and reference of the four forces in every mode [N]."""
     standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
     lower = np.tile([-config.force_x_max, config.force_z_min], 2)
@@ -92,10 +90,7 @@ def force_bounds(
     legs = np.maximum(MODE_ALPHA.sum(axis=1), 1)
     hover = np.outer(mass * GRAVITY / legs, [0.0, 1.0, 0.0, 1.0])
     reference = hover if config.input_reference == "hover" else np.zeros_like(hover)
-    lower, upper, reference = (
-        jnp.asarray(np.where(standing, values, 0.0)) for values in (lower, upper, reference)
-    )
-    return lower, upper, reference
+    return tuple(jnp.asarray(np.where(standing, a, 0.0)) for a in (lower, upper, reference))
 
 
 def reference_trajectory(

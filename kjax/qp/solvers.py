@@ -6,7 +6,7 @@ that are done stand still).
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,15 +28,20 @@ class _Box(NamedTuple):
         return jnp.clip(x, self.lower, self.upper)
 
 
+class _Iteration(NamedTuple):
+    """A method: where it starts from a point, and its step; states have the point as ``x``."""
+
+    init: Callable[[Array], Any]
+    step: Callable[[Any], Any]
+
+
 class _PgState(NamedTuple):
     x: Array
     momentum_point: Array
     t: Array
 
 
-def _projected_gradient(
-    prepared: Prepared, box: _Box
-) -> tuple[Callable[[Array], _PgState], Callable[[_PgState], _PgState]]:
+def _projected_gradient(prepared: Prepared, box: _Box) -> _Iteration:
     """Nesterov's momentum with gradient restart (O'Donoghue and Candes 2015)."""
 
     def init(x: Array) -> _PgState:
@@ -53,7 +58,7 @@ def _projected_gradient(
         beta = jnp.minimum((t_old - 1.0) / t, (1.0 - root) / (1.0 + root))
         return _PgState(x=x, momentum_point=x + beta * (x - state.x), t=t)
 
-    return init, step
+    return _Iteration(init=init, step=step)
 
 
 class _AdmmState(NamedTuple):
@@ -61,9 +66,7 @@ class _AdmmState(NamedTuple):
     dual: Array
 
 
-def _admm(
-    prepared: Prepared, box: _Box
-) -> tuple[Callable[[Array], _AdmmState], Callable[[_AdmmState], _AdmmState]]:
+def _admm(prepared: Prepared, box: _Box) -> _Iteration:
     """Over-relaxed ADMM with the penalty sqrt(eig_min eig_max) (Ghadimi et al. 2015)."""
     relax = 1.6
 
@@ -76,7 +79,7 @@ def _admm(
         x = box.clip(mixed)
         return _AdmmState(x=x, dual=mixed - x)
 
-    return init, step
+    return _Iteration(init=init, step=step)
 
 
 _METHODS = {"admm": _admm, "projected_gradient": _projected_gradient}
@@ -130,20 +133,18 @@ def solve(
         upper=jnp.where(good, upper / d, jnp.inf),
     )
     start = jnp.zeros_like(q) if warm is None else jnp.where(jnp.isfinite(warm), warm, 0.0)
-    init, step = _METHODS[method](prepared, box)
+    iteration = _METHODS[method](prepared, box)
 
     def residual(x: Array) -> Array:
         return natural_residual(prepared.H, box.q, box.lower, box.upper, x)
 
-    def unfinished(carry: tuple[_PgState | _AdmmState, Array, Array]) -> Array:
+    def unfinished(carry: Any) -> Array:
         _, error, count = carry
         return (error > tolerance) & (count < max_iterations)
 
-    def advance(
-        carry: tuple[_PgState | _AdmmState, Array, Array],
-    ) -> tuple[_PgState | _AdmmState, Array, Array]:
+    def advance(carry: Any) -> Any:
         state, _, count = carry
-        state = step(state)  # type: ignore[arg-type]
+        state = iteration.step(state)
         return state, residual(state.x), count + 1
 
     # Start from the better of the warm start and the clipped unconstrained minimiser. Where no
@@ -154,7 +155,7 @@ def solve(
     x0 = jnp.where(free_error < warm_error, free_minimiser, warm_start)
     error0 = jnp.where(good, jnp.minimum(free_error, warm_error), 0.0)
     state, error, count = jax.lax.while_loop(
-        unfinished, advance, (init(x0), error0, jnp.zeros((), jnp.int32))
+        unfinished, advance, (iteration.init(x0), error0, jnp.zeros((), jnp.int32))
     )
     status = jnp.where(good & ~(error <= tolerance), Status.ITERATION_LIMIT, fault)
     # Where the data is faulty the point is the start, inside whatever bounds make sense.

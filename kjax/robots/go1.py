@@ -7,8 +7,10 @@ needs numpy only; ``kjax.sim.scene`` compiles the MJCF.
 
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from typing import Any, cast
 
 import numpy as np
+from jaxtyping import Array
 
 from kjax.types import RobotParams
 
@@ -35,20 +37,25 @@ def _link_com() -> np.ndarray:
     return np.stack([hip, thigh, calf], axis=1)
 
 
+def _f(values: Any) -> Array:
+    """Host array standing in for a device array: this module must not start JAX's backend."""
+    return cast(Array, np.asarray(values, np.float64))
+
+
 PARAMS = RobotParams(
-    mass=np.asarray(_TRUNK_MASS + 4 * _LINK_MASS.sum()),  # 12.743 kg
+    mass=_f(_TRUNK_MASS + 4 * _LINK_MASS.sum()),  # 12.743 kg
     # Composite inertia of all links about the common centre of mass, in ``stand_pose(0.27)``.
-    pitch_inertia=np.asarray(0.394),
-    trunk_mass=np.asarray(_TRUNK_MASS),
-    trunk_com=np.array([0.0223, 0.002, -0.0005]),
-    link_mass=_LINK_MASS,
-    link_com=_link_com(),
-    hip_pos=np.stack([_HIP_X * _FORE, _HIP_Y * _LEFT, np.zeros(4)], axis=-1),
-    abduction_offset=_ABDUCTION * _LEFT,
-    thigh_length=np.asarray(THIGH_LENGTH),
-    calf_length=np.asarray(CALF_LENGTH),
-    foot_radius=np.asarray(FOOT_RADIUS),
-    torque_limit=np.array([23.7, 23.7, 35.55]),
+    pitch_inertia=_f(0.394),
+    trunk_mass=_f(_TRUNK_MASS),
+    trunk_com=_f([0.0223, 0.002, -0.0005]),
+    link_mass=_f(_LINK_MASS),
+    link_com=_f(_link_com()),
+    hip_pos=_f(np.stack([_HIP_X * _FORE, _HIP_Y * _LEFT, np.zeros(4)], axis=-1)),
+    abduction_offset=_f(_ABDUCTION * _LEFT),
+    thigh_length=_f(THIGH_LENGTH),
+    calf_length=_f(CALF_LENGTH),
+    foot_radius=_f(FOOT_RADIUS),
+    torque_limit=_f([23.7, 23.7, 35.55]),
 )
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from kjax.config import RunConfig
@@ -32,12 +33,12 @@ OnTick = Callable[[int, int, mujoco.MjData], None]
 class TickLog(NamedTuple):
     """What is recorded at the MPC rate."""
 
-    stance: Array
-    force: Array
-    velocity_command: Array
-    status: Array
-    residual: Array
-    iterations: Array
+    stance: Any
+    force: Any
+    velocity_command: Any
+    status: Any
+    residual: Any
+    iterations: Any
 
 
 class Simulation(NamedTuple):
@@ -66,9 +67,9 @@ class Simulation(NamedTuple):
     observe: Observe
     controller: Controller
     params: ControllerParams
-    init: Callable[[Array], Array]
-    plan: Callable[[Array, Array], tuple[Array, Array]]
-    act: Callable[[Array, Array], tuple[Array, Array]]
+    init: Callable[[ArrayLike], Array]
+    plan: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
+    act: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
     unpack_log: Callable[[np.ndarray], TickLog]
 
 
@@ -209,10 +210,12 @@ def simulate(
     except KeyboardInterrupt:
         interrupted = True
     wall = time.perf_counter() - begin
+    if done == 0:
+        raise KeyboardInterrupt  # nothing to keep
 
     keep = slice(0, done)
     x, feet = sagittal(simulation.observe, qpos[keep], qvel[keep])
-    log = simulation.unpack_log(np.stack(logs))
+    ticks_log = simulation.unpack_log(np.stack(logs))
     held = np.arange(done) // per_tick
     return Trajectory(
         time=np.arange(done) * config.sim.sim_dt,
@@ -222,13 +225,13 @@ def simulate(
         feet=feet,
         foot_force=foot_force[keep],
         torque=torque[keep].reshape(-1, 4, 3),
-        stance=log.stance[held],
-        force=log.force[held],
-        velocity_command=log.velocity_command[held],
-        plan_status=log.status,
-        plan_residual=log.residual,
-        plan_iterations=log.iterations,
-        plan_time=plan_time[: len(log.status)],
+        stance=ticks_log.stance[held],
+        force=ticks_log.force[held],
+        velocity_command=ticks_log.velocity_command[held],
+        plan_status=ticks_log.status,
+        plan_residual=ticks_log.residual,
+        plan_iterations=ticks_log.iterations,
+        plan_time=plan_time[: len(ticks_log.status)],
         act_time=act_time[keep],
         wall_time=wall,
         fell=fell,

@@ -84,6 +84,7 @@ def _add_world(spec: mujoco.MjSpec) -> None:
         contype=1,
         conaffinity=0,
         material="ground",
+        rgba=[1.0, 1.0, 1.0, 1.0],
     )
     spec.body("trunk").add_light(
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -0.6, 3], dir=[0, 0.2, -1]
@@ -91,7 +92,7 @@ def _add_world(spec: mujoco.MjSpec) -> None:
     spec.body("trunk").add_camera(
         name="side",
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
-        pos=[0.25, -1.45, 0.28],
+        pos=[0.15, -1.25, 0.22],
         xyaxes=[1, 0.12, 0, -0.02, 0.16, 1],
     )
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]

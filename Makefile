@@ -1,0 +1,43 @@
+# Python 3.11 or newer with venv is all that must be present.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: setup trot trot-long fit test test-fast check benchmark clean
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "kjax needs Python 3.11 or newer; say make PYTHON=/path/to/it")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $(STAMP)
+
+trot: setup  ## the main job: trot the paper's velocity profile
+	$(BIN)/python experiments/closed_loop.py configs/trot_velocity.toml
+
+trot-long: setup  ## the same with a prediction of 0.2 s
+	$(BIN)/python experiments/closed_loop.py configs/trot_velocity_long.toml
+
+fit: setup  ## the fit study of the paper's Fig. 3
+	$(BIN)/python experiments/koopman_fit.py configs/koopman_fit.toml
+
+test: setup  ## everything
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+test-fast: setup  ## without the slow tests
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow"
+
+check: setup  ## what to run before a commit
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(MAKE) test-fast
+
+benchmark: setup
+	$(BIN)/python experiments/benchmark.py controller
+
+clean:
+	rm -rf results .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,134 @@
+"""Benchmarks: medians, with a floor measured in the same run.
+
+controller: latency of plan and act in the single-robot loop, beside an empty jitted call of the
+same signature and the bare physics step; real-time factor; first and second start of the main job.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from kjax import cli
+from kjax.config import RunConfig
+from kjax.sim.episode import initial_state, metrics
+from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
+
+BENCHMARKS = ("controller",)
+CALLS = 2000  # timed calls of each function
+WALK = 400  # ms of walking from which the timed inputs are taken
+
+
+def main() -> None:
+    """Parse the command line and run one benchmark."""
+    words = sys.argv[1:]
+    if not words or words[0] not in (*BENCHMARKS, "-h", "--help"):
+        cli.fail(f"which benchmark? one of: {', '.join(BENCHMARKS)}")
+    parser = cli.build_parser(RunConfig, __doc__)
+    parser.prog = f"benchmark.py {words[0]}"
+    parser.add_argument("--no-startup", action="store_true", help="leave out the start-up times")
+    config, args = cli.parse(RunConfig, parser, words[1:] if words[0] in BENCHMARKS else words)
+    folder = args.out or Path("results") / f"benchmark_{words[0]}"
+    args.out = folder
+    cli.output_folder(args, "benchmark")
+    cli.configure_jax(one_core=True)
+    result = controller_latency(config)
+    if not args.no_startup:
+        result |= start_up(args.config)
+    for key, value in result.items():
+        print(f"{key:32}{value:12.4g}")
+    record = {"config": args.config, "provenance": cli.provenance(), **result}
+    cli.save_json(folder / "metrics.json", record)
+    print(f"results in {folder}/")
+
+
+def controller_latency(config: RunConfig) -> dict[str, Any]:
+    """Latency of the compiled calls on inputs from a walk, and of their floors [ms]."""
+    simulation = build_simulation(config)
+    states, sensed, data = _walk(simulation)
+    noop = jax.jit(lambda state, sensed: (state + 1.0, sensed[:12] * 2.0))
+    calls: dict[str, Callable[[Any, Any], Any]] = {
+        "noop": noop,
+        "act": simulation.act,
+        "plan": simulation.plan,
+    }
+    times: dict[str, list[float]] = {name: [] for name in (*calls, "physics")}
+    for call in calls.values():
+        jax.block_until_ready(call(states[0], sensed[0]))
+    for i in range(CALLS):  # interleaved, so that all see the same machine
+        state, inputs = states[i % len(states)], sensed[i % len(sensed)]
+        for name, call in calls.items():
+            clock = time.perf_counter()
+            _, out = call(state, inputs)
+            np.asarray(out)
+            times[name].append(time.perf_counter() - clock)
+        clock = time.perf_counter()
+        mujoco.mj_step(simulation.model, data)
+        times["physics"].append(time.perf_counter() - clock)
+    result: dict[str, Any] = {}
+    for name, values in times.items():
+        result[f"{name}_ms_median"] = 1e3 * float(np.median(values))
+        result[f"{name}_ms_p99"] = 1e3 * float(np.percentile(values, 99))
+    result["act_over_noop"] = result["act_ms_median"] / result["noop_ms_median"]
+    result["plan_over_noop"] = result["plan_ms_median"] / result["noop_ms_median"]
+    runs = [metrics(simulate(simulation, seed=seed), config) for seed in range(3)]
+    result["realtime_factor"] = float(np.median([run["realtime_factor"] for run in runs]))
+    return result
+
+
+def _walk(simulation: Simulation) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
+    """Controller states and sensor vectors along a walk, and the data at its end."""
+    model, at = simulation.model, simulation.addresses
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = initial_state(simulation.config, model.nq, model.nv)
+    mujoco.mj_forward(model, data)
+    states, sensed = [], []
+    state = None
+    for i in range(WALK):
+        now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(30)])
+        state = simulation.init(now) if state is None else state
+        if i % 5 == 0:
+            state, _ = simulation.plan(state, now)
+        states.append(state)
+        sensed.append(now)
+        state, torque = simulation.act(state, now)
+        data.ctrl[at.actuator.reshape(-1)] = torque
+        mujoco.mj_step(model, data)
+    return states, sensed, data
+
+
+def start_up(config: str | None) -> dict[str, float]:
+    """Wall time of the whole main job with an empty and then a filled compile cache [s]."""
+    script = Path(__file__).with_name("closed_loop.py")
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "cache")}
+        command = [sys.executable, str(script), *([config] if config else [])]
+        seconds = []
+        for _ in range(2):
+            clock = time.perf_counter()
+            subprocess.run(
+                [*command, "--out", str(Path(folder) / "run")],
+                env=environment,
+                check=True,
+                capture_output=True,
+            )
+            seconds.append(time.perf_counter() - clock)
+        inner = json.loads((Path(folder) / "run" / "metrics.json").read_text(encoding="utf-8"))
+    return {
+        "first_run_s": seconds[0],
+        "second_run_s": seconds[1],
+        "second_run_realtime_factor": inner["realtime_factor"],
+    }
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,194 @@
+"""Run the Go1 under the Koopman LMPC in MuJoCo: one run, or one per seed.
+
+Leaves metrics.json, config.toml, trajectory.npz, figure.png and, if asked for, video.mp4 in the
+output folder. Ctrl-C stops the run and writes what was simulated. With --seeds, runs that are
+already in the folder's seeds.json (same config, same revision) are not repeated.
+"""
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from kjax import cli
+from kjax.config import RunConfig, to_dict
+from kjax.sim.episode import Trajectory, metrics
+from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
+
+# What the table shows: metric, printed name, format.
+TABLE = (
+    ("velocity_rmse_mps", "velocity RMSE [m/s]", ".4f"),
+    ("pitch_max_deg", "pitch, largest [deg]", ".2f"),
+    ("pitch_p95_deg", "pitch, 95 % [deg]", ".2f"),
+    ("height_mean_m", "CoM height, mean [m]", ".3f"),
+    ("foot_slip_m", "foot slip per stance [m]", ".4f"),
+    ("torque_saturation_fraction", "time with a saturated joint [-]", ".4f"),
+    ("qp_unsolved", "QPs not solved", ".0f"),
+    ("plan_ms_median", "plan, median [ms]", ".3f"),
+    ("act_ms_median", "act, median [ms]", ".3f"),
+    ("realtime_factor", "real-time factor [-]", ".1f"),
+)
+LOWER_IS_WORSE = {"realtime_factor"}
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = cli.build_parser(RunConfig, __doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, help="run this many seeds, from config key 'seed' on")
+    parser.add_argument("--video", action="store_true", help="also write video.mp4")
+    parser.add_argument("--view", action="store_true", help="show the run in MuJoCo's viewer")
+    config, args = cli.parse(RunConfig, parser)
+    if args.seeds is not None and args.seeds < 1:
+        cli.fail(f"--seeds: got {args.seeds}, wanted at least 1")
+    cli.configure_jax(one_core=True)
+    folder = cli.output_folder(args, "closed_loop")
+    clock = time.perf_counter()
+    simulation = build_simulation(config)
+    if args.seeds is None:
+        run = _simulate_with_bar(simulation, config, view=args.view)
+        result = metrics(run, config)
+        cli.save_json(folder / "metrics.json", result)
+        print_table([result])
+    else:
+        run = run_seeds(simulation, config, args.seeds, folder)
+    if run is not None:
+        save_run(run, config, folder, args)
+    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+    if run is not None and run.interrupted:
+        raise SystemExit(130)
+
+
+def save_run(run: Trajectory, config: RunConfig, folder: Path, args: argparse.Namespace) -> None:
+    """Write trajectory, config, figure and, if asked for, the video."""
+    from kjax.viz.plots import closed_loop_figure
+
+    run.save(folder / "trajectory.npz")
+    cli.save_config(folder / "config.toml", config)
+    closed_loop_figure(run, config, folder / "figure.png", title=folder.name)
+    if args.video:
+        from kjax.viz.video import save_video
+
+        print(
+            "video:",
+            save_video(folder / "trajectory.npz", folder / "config.toml", folder / "video.mp4"),
+        )
+
+
+def _simulate_with_bar(
+    simulation: Simulation, config: RunConfig, *, view: bool = False, label: str = ""
+) -> Trajectory:
+    with tqdm(total=config.duration, unit="s", desc=label or "simulated", leave=False, disable=None,
+              bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s "
+              "[{elapsed}<{remaining}, {rate_fmt}]") as bar:  # fmt: skip
+
+        def on_tick(done: int, total: int, data: Any) -> None:
+            if done % 100 == 0 or done == total:
+                bar.update(done * config.sim.sim_dt - bar.n)
+
+        if not view:
+            return simulate(simulation, seed=config.seed, on_tick=on_tick)
+        return _simulate_in_viewer(simulation, config, on_tick)
+
+
+def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTick) -> Trajectory:
+    """Run at real-time pace in MuJoCo's passive viewer."""
+    import mujoco.viewer
+
+    viewer: Any = None
+    begin = time.perf_counter()
+
+    def show(done: int, total: int, data: Any) -> None:
+        nonlocal viewer, begin
+        on_tick(done, total, data)
+        if viewer is None:
+            try:
+                viewer = mujoco.viewer.launch_passive(simulation.model, data)
+            except Exception as error:
+                cli.fail(f"--view: no window can be opened here ({error}); try --video")
+            begin = time.perf_counter() - done * config.sim.sim_dt
+        if not viewer.is_running():
+            raise KeyboardInterrupt
+        viewer.sync()
+        ahead = done * config.sim.sim_dt - (time.perf_counter() - begin)
+        if ahead > 0:
+            time.sleep(ahead)
+
+    try:
+        return simulate(simulation, seed=config.seed, on_tick=show)
+    finally:
+        if viewer is not None:
+            viewer.close()
+
+
+def run_seeds(
+    simulation: Simulation, config: RunConfig, count: int, folder: Path
+) -> Trajectory | None:
+    """Run seeds, each saved as it ends; returns the first run of this call."""
+    path = folder / "seeds.json"
+    record = cli.provenance()
+    plain = {key: value for key, value in to_dict(config).items() if key != "seed"}
+    label = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+    label += "@" + record["git_revision"]
+    done: dict[str, Any] = {}
+    if path.exists():
+        old = json.loads(path.read_text(encoding="utf-8"))
+        if old.get("label") != label:
+            print(f"{path}: other config or revision; starting afresh")
+        else:
+            done = old["seeds"]
+    first = None
+    for seed in range(config.seed, config.seed + count):
+        if str(seed) in done:
+            continue
+        this = dataclasses.replace(config, seed=seed)
+        run = _simulate_with_bar(simulation, this, label=f"seed {seed}")
+        if run.interrupted:
+            print(f"stopped in seed {seed}; run the same command again to go on")
+            return run
+        first = first or run
+        done[str(seed)] = metrics(run, this)
+        chosen = [done[k] for k in done]
+        cli.save_json(
+            path, {"label": label, "provenance": record, "seeds": done, **summary(chosen)}
+        )
+    results = [done[str(s)] for s in range(config.seed, config.seed + count)]
+    print_table(results)
+    return first
+
+
+def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """Median and worst of each metric over runs that did not fall, and the number of falls."""
+    upright = [r for r in results if not r["fell"]]
+    out: dict[str, Any] = {"runs": len(results), "falls": len(results) - len(upright)}
+    for key, _, _ in TABLE:
+        values = [r[key] for r in upright if key in r]
+        if values:
+            worst = min(values) if key in LOWER_IS_WORSE else max(values)
+            out[key] = {"median": float(np.median(values)), "worst": worst}
+    return out
+
+
+def print_table(results: list[dict[str, Any]]) -> None:
+    """One column for a single run; median and worst for several."""
+    total = summary(results)
+    several = len(results) > 1
+    print(f"{'':34}{'median':>10}{'worst':>10}" if several else "")
+    for key, name, form in TABLE:
+        if key in total:
+            median, worst = (format(total[key][k], form) for k in ("median", "worst"))
+            print(f"{name:34}{median:>10}" + (f"{worst:>10}" if several else ""))
+    for result in results:
+        if result["fell"]:
+            print(f"FELL at {result['fall_time_s']:.2f} s")
+    if several:
+        print(f"{total['runs']} runs, {total['falls']} falls")
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,126 @@
+"""Fit the Koopman models of every contact mode and show how well they predict (Fig. 3).
+
+Prints mean, variance, standard deviation and largest absolute error of each state after the test
+rollout, and, in a scan of the sampling ranges, the largest range for which each statistic stays
+within the tolerance. Leaves metrics.json, config.toml and figure.png in the output folder.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kjax import cli
+from kjax.config import FitStudyConfig
+from kjax.koopman.dataset import SampleRanges, ranges_from_config, shrink
+from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
+from kjax.koopman.validate import ErrorStatistics, prediction_errors, summarise
+from kjax.types import MODE_ALPHA, STATE_NAMES, STATE_UNITS, Mode
+
+MODES = {"trot": Mode.TROT, "front": Mode.FRONT, "rear": Mode.REAR}
+STATISTICS = ErrorStatistics._fields
+
+
+def main() -> None:
+    """Parse the command line and run the study."""
+    parser = cli.build_parser(FitStudyConfig, __doc__.splitlines()[0])
+    config, args = cli.parse(FitStudyConfig, parser)
+    cli.configure_jax()
+    folder = cli.output_folder(args, "koopman_fit")
+    koopman, data = config.koopman, config.koopman.dataset
+    dictionary, body = build_dictionary(koopman), srb_params(config.srb)
+    steps = round(config.test_duration / data.dt)
+    chosen = jnp.asarray(list(MODES.values()))
+
+    @jax.jit
+    def study(scale: jax.Array) -> tuple[Any, ErrorStatistics]:
+        """Fit and test on ranges shrunk by ``scale``."""
+        ranges = shrink(ranges_from_config(data, vary_feet=koopman.feet == "measured"), scale)
+        model, report = fit_modes(body, koopman, ranges=ranges)
+
+        def test(mode: jax.Array, alpha: jax.Array) -> ErrorStatistics:
+            still: SampleRanges = ranges._replace(feet_half=jnp.zeros(2))
+            return summarise(
+                prediction_errors(
+                    jax.random.fold_in(jax.random.key(config.test_seed), mode),
+                    jax.tree.map(lambda leaf: leaf[mode], model),
+                    dictionary,
+                    body,
+                    alpha,
+                    still,
+                    states=config.test_states,
+                    profiles=config.test_profiles,
+                    steps=steps,
+                    dt=data.dt,
+                    hold=data.hold,
+                )
+            )
+
+        return report, jax.vmap(test)(chosen, jnp.asarray(MODE_ALPHA, float)[chosen])
+
+    report, statistics = jax.device_get(study(jnp.asarray(1.0)))
+    if not report.finite.all():
+        cli.fail("the fit is not finite: check srb and koopman.dataset ranges")
+    result: dict[str, Any] = {"fit": {}, "error_at_end": {}, "largest_scale_within_tolerance": {}}
+    print(f"dictionary '{koopman.dictionary}', p = {koopman.order}: {dictionary.size} observables")
+    for mode in MODES.values():
+        fit = {
+            "rank": int(report.rank[mode]),
+            "columns": int(report.columns[mode]),
+            "condition": float(report.condition[mode]),
+            "condition_full": float(report.condition_full[mode]),
+            "one_step_residual_rms": report.residual_rms[mode],
+        }
+        result["fit"][mode.name.lower()] = fit
+        print(
+            f"  {mode.name.lower():6} rank {fit['rank']} of {fit['columns']}, condition of the "
+            f"scaled regressor {fit['condition']:.1e} (all columns: {fit['condition_full']:.1e})"
+        )
+
+    curves = {}
+    print(f"\nprediction error after {1e3 * config.test_duration:g} ms, "
+          f"{config.test_states} x {config.test_profiles} rollouts")  # fmt: skip
+    for i, name in enumerate(MODES):
+        here = {key: getattr(statistics, key)[i] for key in STATISTICS}
+        curves[name] = here
+        result["error_at_end"][name] = {
+            key: dict(zip(STATE_NAMES, values[-1], strict=True)) for key, values in here.items()
+        }
+        print(f"  {name:10}" + "".join(f"{key:>12}" for key in STATISTICS))
+        for state, (label, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True)):
+            values = "".join(f"{here[key][-1, state]:12.1e}" for key in STATISTICS)
+            print(f"    {label:5} {unit:6}{values[2:]}")
+
+    print(f"\nlargest fraction of those ranges for which the statistic stays within "
+          f"{config.tolerance:g} in all six states")  # fmt: skip
+    print("  " + " " * 10 + "".join(f"{key:>12}" for key in STATISTICS))
+    scan = {s: jax.device_get(study(jnp.asarray(s)))[1] for s in sorted(config.scales)}
+    for i, name in enumerate(MODES):
+        best = {key: _largest_scale(scan, key, i, config.tolerance) for key in STATISTICS}
+        result["largest_scale_within_tolerance"][name] = best
+        shown = "".join(f"{'none' if v is None else format(v, 'g'):>12}" for v in best.values())
+        print(f"  {name:10}{shown}")
+
+    from kjax.viz.plots import fit_figure
+
+    fit_figure(curves, data.dt * np.arange(1, steps + 1), folder / "figure.png", STATE_NAMES)
+    cli.save_json(folder / "metrics.json", result)
+    cli.save_config(folder / "config.toml", config)
+    print(f"\nresults in {folder}/")
+
+
+def _largest_scale(
+    scan: dict[float, ErrorStatistics], key: str, mode: int, tolerance: float
+) -> float | None:
+    """Largest scale up to which the statistic holds at every smaller scale as well."""
+    best = None
+    for scale, statistics in scan.items():
+        if np.abs(getattr(statistics, key)[mode]).max() > tolerance:
+            break
+        best = scale
+    return best
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,139 @@
+"""Videos of runs: MuJoCo's renderer where a GL library loads, a stick animation where none does.
+
+Rendering happens in a child process per GL backend, since the backend is fixed when mujoco is
+imported and a broken driver can take the process with it.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+from PIL import Image, ImageDraw
+
+from kjax.config import RunConfig, load_config
+from kjax.robots import go1
+from kjax.sim.episode import Trajectory
+from kjax.types import Leg
+
+FPS = 25
+# Left legs are behind the right ones in a view from the right.
+_FAR_TO_NEAR = {Leg.FL: "#90cdf4", Leg.RL: "#9ae6b4", Leg.FR: "#c53030", Leg.RR: "#dd6b20"}
+SIZE = (640, 368)  # pixels; multiples of 16, as video codecs want
+
+
+def save_video(trajectory_file: Path, config_file: Path, path: Path) -> str:
+    """Write an mp4 of a saved run; returns a line that says how it was drawn.
+
+    Args:
+      trajectory_file: ``trajectory.npz`` of the run.
+      config_file: ``config.toml`` of the run.
+      path: video to write.
+    """
+    wanted = os.environ.get("MUJOCO_GL")
+    failures = []
+    for backend in [wanted] if wanted else ["egl", "osmesa"]:
+        command = [sys.executable, "-m", "kjax.viz.video"]
+        child = subprocess.run(
+            [*command, str(trajectory_file), str(config_file), str(path)],
+            env={**os.environ, "MUJOCO_GL": backend},
+            capture_output=True,
+            text=True,
+        )
+        if child.returncode == 0:
+            return f"rendered with MuJoCo ({backend})"
+        last = (child.stderr.strip().splitlines() or ["no message"])[-1]
+        failures.append(f"{backend}: {last[:120]}")
+    stick_video(Trajectory.load(trajectory_file), path)
+    return "no GL library loads (" + "; ".join(failures) + "): drew a stick animation"
+
+
+def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
+    """Draw a run with MuJoCo's renderer, following the robot from its right side."""
+    import mujoco
+
+    from kjax.sim.scene import build_model
+
+    model = build_model(config.sim)
+    data = mujoco.MjData(model)
+    renderer = mujoco.Renderer(model, height=SIZE[1], width=SIZE[0])
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+    with imageio.get_writer(path, format="FFMPEG", mode="I", fps=FPS) as writer:
+        for i in _frames(run):
+            data.qpos[:], data.qvel[:] = run.qpos[i], run.qvel[i]
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera="side")
+            writer.append_data(_captioned(renderer.render(), run, i))
+    renderer.close()
+
+
+def stick_video(run: Trajectory, path: Path) -> None:
+    """Draw a run as a side view of lines: trunk, legs, ground, obstacles of the path left out."""
+    scale, ground = 620.0, 300.0  # pixels per metre; row of z = 0
+    with imageio.get_writer(path, format="FFMPEG", mode="I", fps=FPS) as writer:
+        for i in _frames(run):
+            image = Image.new("RGB", SIZE, "white")
+            draw = ImageDraw.Draw(image)
+
+            def at(point: np.ndarray, centre: float = run.qpos[i, 0]) -> tuple[float, float]:
+                return (SIZE[0] / 2 + scale * (point[0] - centre), ground - scale * point[1])
+
+            draw.line([(0, ground), (SIZE[0], ground)], fill="#718096", width=2)
+            for tick in np.arange(np.floor(run.qpos[i, 0]) - 1, run.qpos[i, 0] + 2, 0.1):
+                x, _ = at(np.array([tick, 0.0]))
+                draw.line([(x, ground), (x - 5, ground + 8)], fill="#a0aec0")
+            trunk, legs = _sticks(run.qpos[i])
+            for leg, colour in zip(
+                (1, 3, 0, 2), ("#90cdf4", "#9ae6b4", "#c53030", "#dd6b20"), strict=True
+            ):
+                draw.line([at(p) for p in legs[leg]], fill=colour, width=5)
+                x, y = at(legs[leg, 2])
+                draw.ellipse([x - 8, y - 8, x + 8, y + 8], fill=colour)
+            draw.line([at(p) for p in trunk], fill="#2d3748", width=22)
+            writer.append_data(_captioned(np.asarray(image), run, i))
+
+
+def _sticks(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Trunk ends (2, 2) and hip, knee, foot of each leg (4, 3, 2), world (x, z) [m]."""
+    turn = qpos[2]  # MuJoCo's angle about +y
+    rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    hips = np.asarray(go1.PARAMS.hip_pos)[:, ::2]
+    joints = qpos[3:].reshape(4, 3)
+    down = -np.stack([np.sin(joints[:, 1]), np.cos(joints[:, 1])], axis=-1)
+    total = joints[:, 1] + joints[:, 2]
+    knees = hips + go1.THIGH_LENGTH * down
+    feet = knees - go1.CALF_LENGTH * np.stack([np.sin(total), np.cos(total)], axis=-1)
+    legs = np.stack([hips, knees, feet], axis=1) @ rotation.T + qpos[:2]
+    trunk = np.array([[0.24, 0.0], [-0.22, 0.0]]) @ rotation.T + qpos[:2]
+    return trunk, legs
+
+
+def _frames(run: Trajectory) -> np.ndarray:
+    """Sample indices of the frames, ``FPS`` per second of simulated time."""
+    return np.searchsorted(run.time, np.arange(0.0, run.time[-1], 1.0 / FPS))
+
+
+def _captioned(frame: np.ndarray, run: Trajectory, i: int) -> np.ndarray:
+    image = Image.fromarray(frame)
+    text = (
+        f"t = {run.time[i]:5.2f} s    v_x = {run.x[i, 3]:+.2f} m/s    "
+        f"command {run.velocity_command[i]:+.2f} m/s"
+    )
+    ImageDraw.Draw(image).text((12, 10), text, fill=(30, 30, 30), font_size=15)
+    return np.asarray(image)
+
+
+def main() -> None:
+    """Child process: TRAJECTORY CONFIG VIDEO."""
+    trajectory_file, config_file, path = (Path(word) for word in sys.argv[1:4])
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        scratch = Path(folder) / path.name
+        render_video(Trajectory.load(trajectory_file), load_config(RunConfig, config_file), scratch)
+        scratch.replace(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from kjax import cli
+from kjax.config import RunConfig
+
+
+def parse(*words):
+    return cli.parse(RunConfig, cli.build_parser(RunConfig, "test"), list(words))
+
+
+def refusal(capsys, *words):
+    with pytest.raises(SystemExit) as caught:
+        parse(*words)
+    assert caught.value.code == 2
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1, text
+    return text
+
+
+def test_any_key_can_be_overridden_by_its_dotted_name():
+    config, _ = parse("--lmpc.horizon", "9", "--gait.name=stand", "--lmpc.force_z_min", "-5.0")
+    assert (config.lmpc.horizon, config.gait.name, config.lmpc.force_z_min) == (9, "stand", -5.0)
+
+
+def test_lists_are_written_as_in_toml():
+    config, _ = parse("--command.times", "[0, 1]", "--command.velocities", "[-0.1, 0.2]")
+    assert config.command.velocities == (-0.1, 0.2)
+
+
+def test_an_unknown_option_is_one_line_with_the_nearest_name(capsys):
+    assert "did you mean --lmpc.horizon?" in refusal(capsys, "--lmpc.horizn", "3")
+
+
+def test_a_bad_value_is_one_line(capsys):
+    assert "greater than 0" in refusal(capsys, "--lmpc.horizon", "0")
+    assert "no such file" in refusal(capsys, "configs/nowhere.toml")
+
+
+def test_help_shows_every_key_with_type_unit_and_default(capsys):
+    with pytest.raises(SystemExit):
+        parse("--help")
+    text = " ".join(capsys.readouterr().out.split())
+    assert "--lmpc.control_dt FLOAT Time between two plans [s]. default: 0.005" in text
+    assert "--gait.name {trot,stand}" in text
+
+
+def test_an_unwritable_folder_is_one_line(capsys, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    _, args = parse("--out", str(blocked / "run"))
+    with pytest.raises(SystemExit) as caught:
+        cli.output_folder(args, "x")
+    assert caught.value.code == 2
+    assert str(blocked) in capsys.readouterr().err
+
+
+def test_json_has_no_nan_and_is_written_whole(tmp_path):
+    path = tmp_path / "m.json"
+    cli.save_json(path, {"a": np.float64(1.5), "b": float("nan"), "c": np.arange(2)})
+    assert json.loads(path.read_text()) == {"a": 1.5, "b": None, "c": [0, 1]}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_saved_config_can_be_run_again(tmp_path):
+    config, _ = parse("--lmpc.horizon", "9", "--seed", "3")
+    path = tmp_path / "config.toml"
+    cli.save_config(path, config)
+    assert "git_revision" in path.read_text()
+    assert parse(str(path))[0] == config
+
+
+def test_the_core_imports_neither_mujoco_nor_matplotlib():
+    code = (
+        "import sys, kjax, kjax.robots.go1;"
+        "print([m for m in ('mujoco', 'matplotlib', 'optax', 'tqdm') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
