@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import json
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from kjax import cli
-from kjax.config import RunConfig, to_dict
+from kjax.config import ConfigError, RunConfig, to_dict
 from kjax.sim.episode import Trajectory, metrics
 from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
 
@@ -49,7 +50,10 @@ def main() -> None:
     cli.configure_jax(one_core=True)
     folder = cli.output_folder(args, "closed_loop")
     clock = time.perf_counter()
-    simulation = build_simulation(config)
+    try:
+        simulation = build_simulation(config)
+    except ConfigError as error:
+        cli.fail(str(error))
     if args.seeds is None:
         run = _simulate_with_bar(simulation, config, view=args.view)
         result = metrics(run, config)
@@ -98,8 +102,13 @@ def _simulate_with_bar(
 
 def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTick) -> Trajectory:
     """Run at real-time pace in MuJoCo's passive viewer."""
+    import glfw
     import mujoco.viewer
 
+    # MuJoCo's viewer ends the process where there is no display, so ask first.
+    with warnings.catch_warnings(action="ignore"):
+        if not glfw.init():
+            cli.fail("--view: no window can be opened here (no display?); try --video")
     viewer: Any = None
     begin = time.perf_counter()
 
@@ -107,10 +116,7 @@ def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTi
         nonlocal viewer, begin
         on_tick(done, total, data)
         if viewer is None:
-            try:
-                viewer = mujoco.viewer.launch_passive(simulation.model, data)
-            except Exception as error:
-                cli.fail(f"--view: no window can be opened here ({error}); try --video")
+            viewer = mujoco.viewer.launch_passive(simulation.model, data)
             begin = time.perf_counter() - done * config.sim.sim_dt
         if not viewer.is_running():
             raise KeyboardInterrupt

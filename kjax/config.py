@@ -229,8 +229,8 @@ class SimConfig:
 
     sim_dt: Positive = 0.001
     """Physics step; torques are recomputed at each [s]."""
-    base: Literal["planar"] = "planar"
-    """Trunk on two slides and a pitch hinge (the free base comes with 3D control) [-]."""
+    base: Literal["planar", "free"] = "planar"
+    """Trunk on two slides and a pitch hinge, or free; the controller walks the planar one [-]."""
     friction: Positive = 0.8
     """Sliding friction coefficient of the feet [-]."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"

@@ -1,5 +1,6 @@
 """How well a model predicts: error of every state against the time since the start."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -60,10 +61,10 @@ def prediction_errors(
       dt: their length [s].
       hold: steps per random force.
     """
-    options = {"steps": steps, "dt": dt, "hold": hold}
+    draw = partial(sample, params=body, alpha=alpha, ranges=ranges, steps=steps, dt=dt, hold=hold)
     key_state, key_input = jax.random.split(key)
-    starts = sample(key_state, body, alpha, ranges, rollouts=states, **options).states[:, 0]
-    inputs = sample(key_input, body, alpha, ranges, rollouts=profiles, **options).inputs
+    starts = draw(key_state, rollouts=states).states[:, 0]
+    inputs = draw(key_input, rollouts=profiles).inputs
 
     def one(x0: Array, u: Array) -> Array:
         truth = srb.rollout(body, alpha, x0, u, dt)

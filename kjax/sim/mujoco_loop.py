@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from kjax.config import RunConfig
+from kjax.config import ConfigError, RunConfig
 from kjax.controller import (
     Controller,
     ControllerParams,
@@ -74,7 +74,13 @@ class Simulation(NamedTuple):
 
 
 def build_simulation(config: RunConfig) -> Simulation:
-    """Model, controller and compiled calls for a config."""
+    """Model, controller and compiled calls for a config.
+
+    Raises:
+      ConfigError: for a base that the controller cannot walk.
+    """
+    if config.sim.base != "planar":
+        raise ConfigError(f"sim.base: got '{config.sim.base}', the controller walks 'planar' only")
     model = build_model(config.sim)
     observe = build_observe(model, config.sim.contact_threshold)
     controller, params = build_controller(config), build_params(config, go1.PARAMS)

@@ -61,15 +61,27 @@ def resolve(model: mujoco.MjModel) -> Addresses:
 
 
 def build_observe(model: mujoco.MjModel, contact_threshold: float) -> Observe:
-    """Function (qpos, qvel, sensordata) -> Observation for a planar-base model.
+    """Function (qpos, qvel, sensordata) -> Observation for a model of either base.
 
     Args:
       model: from ``sim.scene``.
       contact_threshold: foot force above which a contact counts [N].
     """
     at = resolve(model)
+    is_free = model.nq == 19
 
-    def observe(qpos: Array, qvel: Array, sensordata: Array) -> Observation:
+    def observe_free(qpos: Array, qvel: Array, sensordata: Array) -> Observation:
+        return Observation(
+            base_pos=qpos[:3],
+            base_quat=qpos[3:7],
+            base_vel=qvel[:3],
+            base_ang_vel=qvel[3:6],
+            joint_pos=qpos[at.qpos],
+            joint_vel=qvel[at.qvel],
+            contact=sensordata[at.foot_force] > contact_threshold,
+        )
+
+    def observe_planar(qpos: Array, qvel: Array, sensordata: Array) -> Observation:
         zero = jnp.zeros_like(qpos[0])
         half = 0.5 * qpos[2]  # MuJoCo's angle about +y, nose-down positive
         return Observation(
@@ -82,7 +94,7 @@ def build_observe(model: mujoco.MjModel, contact_threshold: float) -> Observe:
             contact=sensordata[at.foot_force] > contact_threshold,
         )
 
-    return observe
+    return observe_free if is_free else observe_planar
 
 
 NOISE_DIM = 30  # planar: x, z, pitch; their rates; 12 joint angles; 12 joint rates

@@ -28,7 +28,7 @@ def build_spec(config: SimConfig) -> mujoco.MjSpec:
             geom.friction[0] = config.friction
         elif config.contacts == "feet":
             geom.contype, geom.conaffinity = 0, 0
-    _add_base(spec)
+    _add_base(spec, config.base)
     _add_world(spec)
     return spec
 
@@ -38,7 +38,7 @@ def build_model(config: SimConfig) -> mujoco.MjModel:
     return build_spec(config).compile()
 
 
-def _add_base(spec: mujoco.MjSpec, base: str = "planar") -> None:
+def _add_base(spec: mujoco.MjSpec, base: str) -> None:
     """Joints of the trunk: two slides and a pitch hinge, or a free joint."""
     trunk = spec.body("trunk")
     if base == "free":

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -61,7 +62,7 @@ def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
     data = mujoco.MjData(model)
     renderer = mujoco.Renderer(model, height=SIZE[1], width=SIZE[0])
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-    with imageio.get_writer(path, format="FFMPEG", mode="I", fps=FPS) as writer:
+    with _writer(path) as writer:
         for i in _frames(run):
             data.qpos[:], data.qvel[:] = run.qpos[i], run.qvel[i]
             mujoco.mj_forward(model, data)
@@ -73,7 +74,7 @@ def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
 def stick_video(run: Trajectory, path: Path) -> None:
     """Draw a run as a side view of lines: trunk, legs, ground, obstacles of the path left out."""
     scale, ground = 620.0, 300.0  # pixels per metre; row of z = 0
-    with imageio.get_writer(path, format="FFMPEG", mode="I", fps=FPS) as writer:
+    with _writer(path) as writer:
         for i in _frames(run):
             image = Image.new("RGB", SIZE, "white")
             draw = ImageDraw.Draw(image)
@@ -109,6 +110,10 @@ def _sticks(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     legs = np.stack([hips, knees, feet], axis=1) @ rotation.T + qpos[:2]
     trunk = np.array([[0.24, 0.0], [-0.22, 0.0]]) @ rotation.T + qpos[:2]
     return trunk, legs
+
+
+def _writer(path: Path) -> Any:
+    return imageio.get_writer(path, format="FFMPEG", mode="I", fps=FPS)
 
 
 def _frames(run: Trajectory) -> np.ndarray:

@@ -107,3 +107,31 @@ def test_noise_scale_follows_the_config():
     scale = noise_scale(NoiseConfig())
     assert scale.shape == (NOISE_DIM,)
     assert scale[2] == NoiseConfig().pitch
+
+
+def test_the_same_mjcf_gives_a_free_base_with_the_same_robot():
+    free = build_model(SimConfig(base="free"))
+    planar = build_model(SimConfig())
+    assert (free.nq, free.nv, free.nu) == (19, 18, 12)
+    assert (planar.nq, planar.nv, planar.nu) == (15, 15, 12)
+    np.testing.assert_array_equal(free.body_mass, planar.body_mass)
+    np.testing.assert_array_equal(free.body_inertia, planar.body_inertia)
+
+
+def test_both_bases_show_the_controller_the_same_robot(model, data):
+    free_model = build_model(SimConfig(base="free"))
+    free = mujoco.MjData(free_model)
+    half = 0.5 * data.qpos[2]
+    free.qpos[:7] = [data.qpos[0], 0, data.qpos[1], np.cos(half), 0, np.sin(half), 0]
+    free.qvel[:6] = [data.qvel[0], 0, data.qvel[1], 0, data.qvel[2], 0]
+    free.qpos[7:], free.qvel[6:] = data.qpos[3:], data.qvel[3:]
+    mujoco.mj_forward(free_model, free)
+    ours, theirs = observed(model, data), observed(free_model, free)
+    for a, b in zip(ours[:-1], theirs[:-1], strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_feet_only_contacts_leave_the_feet_and_nothing_else():
+    model = build_model(SimConfig(contacts="feet"))
+    solid = [model.geom(i).name for i in range(model.ngeom) if model.geom_conaffinity[i]]
+    assert sorted(solid) == ["FL_foot", "FR_foot", "RL_foot", "RR_foot"]

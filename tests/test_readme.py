@@ -1,0 +1,69 @@
+"""What the README shows is run as written."""
+
+import re
+
+import jax
+import mujoco
+import numpy as np
+
+from kjax import RunConfig
+from kjax.robots import go1
+from kjax.sim.observe import resolve
+from kjax.sim.scene import build_model
+
+
+def blocks(repository, language):
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+def test_the_controller_example_walks_somebody_elses_robot(repository):
+    """The reader's loop: raw MuJoCo here, none of kjax's simulation code but the scene."""
+    (code,) = blocks(repository, "python")
+    model = build_model(RunConfig().sim)
+    at = resolve(model)
+    data = mujoco.MjData(model)
+    height, joints = go1.stand_pose(0.27)
+    data.qpos[1], data.qpos[3:] = height, joints.reshape(-1)
+    mujoco.mj_forward(model, data)
+    heights = []
+
+    def read_robot():
+        trunk = data.body("trunk")
+        return {
+            "base_pos": trunk.xpos.copy(),
+            "base_quat": trunk.xquat.copy(),
+            "base_vel": np.array([data.qvel[0], 0.0, data.qvel[1]]),
+            "base_ang_vel": np.array([0.0, data.qvel[2], 0.0]),
+            "joint_pos": data.qpos[at.qpos],
+            "joint_vel": data.qvel[at.qvel],
+            "contact": data.sensordata[at.foot_force] > 5.0,
+        }
+
+    def send_torque(torque):
+        data.ctrl[at.actuator] = torque
+        mujoco.mj_step(model, data)
+        mujoco.mj_kinematics(model, data)
+        heights.append(data.qpos[1])
+
+    scope = {"read_robot": read_robot, "send_torque": send_torque}
+    with jax.enable_x64(False):  # the precision that a reader gets without asking
+        exec(code, scope)
+    assert len(heights) == 1000
+    assert 0.25 < min(heights) < max(heights) < 0.31
+    assert int(scope["info"].status) == 0
+
+
+def test_the_commands_name_files_and_keys_that_exist(repository):
+    text = "\n".join(blocks(repository, "bash"))
+    for path in re.findall(r"(?:experiments|configs)/\w+\.\w+", text):
+        assert (repository / path).is_file(), path
+    targets = (repository / "Makefile").read_text()
+    for target in re.findall(r"make ([\w-]+)", text):
+        assert f"\n{target}: " in targets, target
+
+
+def test_pictures_of_the_readme_are_in_the_repository(repository):
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
+        assert (repository / path).is_file(), path
