@@ -82,11 +82,11 @@ def build_schedule(gaits: list[list[Phase]]) -> Schedule:
     phases = [[gait[min(i, len(gait) - 1)] for i in range(padded)] for gait in gaits]
     return Schedule(
         phases=jnp.asarray([len(gait) for gait in gaits]),
-        duration=jnp.asarray([[p.duration for p in row] for row in phases]),
+        duration=jnp.asarray([[p.duration for p in row] for row in phases], float),
         mode=jnp.asarray([[int(p.mode) for p in row] for row in phases]),
         stance=jnp.asarray([[p.stance for p in row] for row in phases]),
-        time_to_touchdown=jnp.asarray(np.array([[t[0] for t in row] for row in rows])),
-        stance_time=jnp.asarray(np.array([[t[1] for t in row] for row in rows])),
+        time_to_touchdown=jnp.asarray(np.array([[t[0] for t in row] for row in rows], float)),
+        stance_time=jnp.asarray(np.array([[t[1] for t in row] for row in rows], float)),
     )
 
 

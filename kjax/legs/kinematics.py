@@ -69,8 +69,11 @@ def inverse(
       foot: (4, 2) target (x, z) relative to the thigh joint, trunk frame [m].
     """
     l1, l2 = robot.thigh_length, robot.calf_length
-    square = jnp.maximum(jnp.sum(foot**2, axis=-1), 1e-12)
     low, high = REACH[0] * (l1 + l2), REACH[1] * (l1 + l2)
+    # The hip itself has no direction: take straight down, before any square root sees it.
+    at_hip = jnp.sum(foot**2, axis=-1, keepdims=True) < 1e-12
+    foot = jnp.where(at_hip, jnp.stack([jnp.zeros_like(low), -low]), foot)
+    square = jnp.sum(foot**2, axis=-1)
     factor = jnp.sqrt(jnp.clip(square, low**2, high**2) / square)
     x, z = foot[:, 0] * factor, foot[:, 1] * factor
     cosine = (square * factor**2 - l1**2 - l2**2) / (2.0 * l1 * l2)

@@ -139,13 +139,16 @@ def solve(
         return natural_residual(prepared.H, box.q, box.lower, box.upper, x)
 
     def unfinished(carry: Any) -> Array:
-        _, error, count = carry
+        _, _, error, count = carry
         return (error > tolerance) & (count < max_iterations)
 
     def advance(carry: Any) -> Any:
-        state, _, count = carry
+        state, best, best_error, count = carry
         state = iteration.step(state)
-        return state, residual(state.x), count + 1
+        error = residual(state.x)
+        better = error < best_error
+        best = jnp.where(better, state.x, best)
+        return state, best, jnp.where(better, error, best_error), count + 1
 
     # Start from the better of the warm start and the clipped unconstrained minimiser. Where no
     # bound is active, the common case of a walking robot, the latter is the solution.
@@ -154,13 +157,13 @@ def solve(
     warm_error, free_error = residual(warm_start), residual(free_minimiser)
     x0 = jnp.where(free_error < warm_error, free_minimiser, warm_start)
     error0 = jnp.where(good, jnp.minimum(free_error, warm_error), 0.0)
-    state, error, count = jax.lax.while_loop(
-        unfinished, advance, (iteration.init(x0), error0, jnp.zeros((), jnp.int32))
+    _, best, error, count = jax.lax.while_loop(
+        unfinished, advance, (iteration.init(x0), x0, error0, jnp.zeros((), jnp.int32))
     )
     status = jnp.where(good & ~(error <= tolerance), Status.ITERATION_LIMIT, fault)
     # Where the data is faulty the point is the start, inside whatever bounds make sense.
     fallback = jnp.clip(start, jnp.nan_to_num(lower, nan=0.0), jnp.nan_to_num(upper, nan=0.0))
-    x = jnp.where(good, jnp.clip(state.x * d, lower, upper), fallback)
+    x = jnp.where(good, jnp.clip(best * d, lower, upper), fallback)
     return Solution(
         x=x,
         status=status.astype(jnp.int32),

@@ -73,8 +73,8 @@ def stand_pose(com_height: float) -> tuple[float, np.ndarray]:
     for _ in range(50):  # the legs' share of the centre of mass moves little: contracts fast
         drop = trunk_height - FOOT_RADIUS
         cosine = (drop**2 - l1**2 - l2**2) / (2 * l1 * l2)
-        if not -0.94 < cosine < 0.62:  # knee within -2.80 .. -0.90 rad
-            raise ValueError(f"com_height must be about 0.12 to 0.39 m, got {com_height}")
+        if not (drop > 0 and -0.942 < cosine < 0.622):  # knee within -2.80 .. -0.90 rad
+            raise ValueError(f"com_height must be about 0.10 to 0.37 m, got {com_height}")
         calf = -np.arccos(cosine)
         thigh = -np.arctan2(l2 * np.sin(calf), l1 + l2 * np.cos(calf))
         offset = _com_height_in_trunk(thigh, calf)

@@ -1,0 +1,173 @@
+"""Settings that every test runs under, and the expensive things that tests share."""
+
+import os
+from functools import cache
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import chex
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_cpu_enable_async_dispatch", False)
+jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".cache" / "jax"))
+# Most of the time goes into hundreds of small programs, so that all of them are kept.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+# Shapes and dtypes of annotated arguments are checked in tests only, so before kjax is imported.
+CHECKED = (
+    "kjax.srb",
+    "kjax.koopman.dataset",
+    "kjax.koopman.models",
+    "kjax.koopman.observables",
+    "kjax.qp",
+    "kjax.mpc",
+    "kjax.legs",
+)
+install_import_hook(CHECKED, "beartype.beartype")
+
+from kjax import srb
+from kjax.koopman import dataset, edmd, observables
+from kjax.robots import go1
+from kjax.types import MODE_ALPHA, Leg
+
+DT = 1e-3  # s, step of the shared snapshots
+
+
+@pytest.fixture(autouse=True)
+def _fresh_trace_counter():
+    """``chex.assert_max_traces`` counts by name and line; start each test from zero."""
+    chex.clear_trace_counter()
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """Both floating types; cast the inputs to it and ask for it back."""
+    return np.dtype(request.param)
+
+
+@pytest.fixture(scope="session")
+def body():
+    """A rigid body much like the Go1, float64."""
+    return srb.SrbParams(
+        mass=jnp.asarray(12.7),
+        inertia=jnp.asarray(0.39),
+        feet=jnp.asarray([[0.19, -0.25], [-0.18, -0.26]]),
+    )
+
+
+@pytest.fixture(scope="session")
+def draw(body):
+    """Compiled sampler: (key, feet half-ranges (2,)) -> snapshots of all modes."""
+
+    def ranges(feet_half):
+        return dataset.SampleRanges(
+            state_centre=jnp.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0]),
+            state_half=jnp.array([0.5, 0.1, 0.3, 1.0, 0.5, 2.0]),
+            input_low=jnp.array([-60.0, 0.0, -60.0, 0.0]),
+            input_high=jnp.array([60.0, 150.0, 60.0, 150.0]),
+            feet_half=feet_half,
+        )
+
+    def one(key, alpha, feet_half):
+        return dataset.sample(key, body, alpha, ranges(feet_half), rollouts=40, steps=25, dt=DT)
+
+    def modes(key, feet_half):
+        keys = jax.random.split(key, len(MODE_ALPHA))
+        return jax.vmap(one, in_axes=(0, 0, None))(keys, jnp.asarray(MODE_ALPHA, float), feet_half)
+
+    return jax.jit(modes)
+
+
+@pytest.fixture(scope="session")
+def snapshots(draw):
+    """Training data of every contact mode with the body's own contact points."""
+    return draw(jax.random.key(0), jnp.zeros(2))
+
+
+@pytest.fixture(scope="session")
+def snapshots_moving_feet(draw):
+    """Training data of every contact mode with contact points that vary between rollouts."""
+    return draw(jax.random.key(1), jnp.array([0.12, 0.05]))
+
+
+@pytest.fixture(scope="session")
+def fit_modes():
+    """Compiled EDMD over modes: (literal, feet_terms) -> function of stacked snapshots."""
+
+    @cache
+    def build(*, literal=False, feet_terms=False):
+        dictionary = observables.paper(4, literal=literal)
+        return jax.jit(jax.vmap(lambda data: edmd.fit(dictionary, data, feet_terms=feet_terms)))
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def fitted(fit_modes, snapshots):
+    """Models and reports of all modes with the paper's dictionary, fixed contact points."""
+    return fit_modes()(snapshots)
+
+
+@pytest.fixture(scope="session")
+def fitted_moving_feet(fit_modes, snapshots_moving_feet):
+    """Models and reports of all modes whose input map depends on the contact points."""
+    return fit_modes(feet_terms=True)(snapshots_moving_feet)
+
+
+@pytest.fixture(scope="session")
+def planar_go1():
+    """Go1 in C MuJoCo on two slides and a pitch hinge, assembled here without ``kjax.sim``."""
+    spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    trunk = spec.body("trunk")
+    for name, kind, axis in (
+        ("root_x", slide, [1, 0, 0]),
+        ("root_z", slide, [0, 0, 1]),
+        ("root_pitch", hinge, [0, 1, 0]),
+    ):
+        trunk.add_joint(name=name, type=kind, axis=axis, damping=[0, 0, 0], armature=0)
+    return spec.compile()
+
+
+@pytest.fixture(scope="session")
+def leg_joints(planar_go1):
+    """Joint ids (4, 3) by name: leg order of ``types.Leg``, then abduction, thigh, calf."""
+    names = ("abduction", "thigh", "calf")
+    return np.array([[planar_go1.joint(f"{leg.name}_{n}").id for n in names] for leg in Leg])
+
+
+@pytest.fixture(scope="session")
+def random_qp():
+    """Factory of box QPs built from a known KKT point: seed -> (H, q, lower, upper, x), float64.
+
+    A third of the variables rest at their lower bound, a third at the upper one, each pushed by a
+    multiplier; the rest are free. The Jacobi-scaled Hessian has about the condition asked for.
+    """
+
+    def build(seed, *, n=12, condition=100.0):
+        rng = np.random.default_rng(seed)
+        basis, _ = np.linalg.qr(rng.normal(size=(n, n)))
+        H = basis @ np.diag(np.geomspace(1.0, condition, n)) @ basis.T
+        H = 0.5 * (H + H.T)
+        x = rng.normal(size=n)
+        push = rng.uniform(0.1, 2.0, n)  # strict complementarity
+        kind = np.arange(n) % 3
+        lower = np.where(kind == 0, x, x - rng.uniform(0.1, 2.0, n))
+        upper = np.where(kind == 1, x, x + rng.uniform(0.1, 2.0, n))
+        gradient = np.select([kind == 0, kind == 1], [push, -push], 0.0)
+        return H, gradient - H @ x, lower, upper, x
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def repository():
+    """Root folder of the checkout."""
+    return Path(__file__).parents[1]

@@ -1,0 +1,276 @@
+"""Tables and plans: the closed-form regulator, bounds, swing ends, contact points."""
+
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kjax import srb
+from kjax.config import LmpcConfig
+from kjax.koopman import models, observables
+from kjax.mpc import lmpc
+from kjax.qp import Status
+from kjax.types import MODE_ALPHA, Mode
+
+DT = 1e-3  # s, step of the fitted models
+MASS = 12.7
+G = 9.81
+FREE = LmpcConfig(
+    horizon=4,
+    model_dt=0.005,
+    force_x_max=np.inf,
+    force_z_min=-np.inf,
+    force_z_max=np.inf,
+    input_reference="hover",
+)
+BOUNDED = LmpcConfig(horizon=4, model_dt=0.005, force_z_min=5.0, tolerance=1e-9)
+
+lift = jax.jit(observables.paper(4).lift)
+reference_trajectory = jax.jit(lmpc.reference_trajectory, static_argnames=("model_dt", "horizon"))
+build = jax.jit(lmpc.build_tables, static_argnames=("config", "data_dt", "mass"))
+solve = jax.jit(lmpc.solve_lmpc, static_argnames="config")
+
+
+def cast(tree, dtype):
+    """Floating leaves in another precision, the rest as they are."""
+    return jax.tree.map(
+        lambda a: np.asarray(a, dtype if jnp.issubdtype(a.dtype, jnp.floating) else None), tree
+    )
+
+
+@pytest.fixture(scope="module")
+def model(fitted):
+    return fitted[0]
+
+
+@pytest.fixture(scope="module")
+def free(model, body):
+    return build(model, config=FREE, data_dt=DT, mass=MASS, feet=body.feet)
+
+
+@pytest.fixture(scope="module")
+def bounded(model, body):
+    return build(model, config=BOUNDED, data_dt=DT, mass=MASS, feet=body.feet)
+
+
+@pytest.fixture(scope="module")
+def start():
+    """A disturbed state (6,) and a reference (4, 6) of walking at 0.3 m/s."""
+    x = jnp.array([0.02, 0.25, 0.05, 0.1, -0.1, 0.4])
+    reference = reference_trajectory(
+        position=jnp.asarray(0.0),
+        height=jnp.asarray(0.27),
+        velocity=jnp.asarray(0.3),
+        model_dt=0.005,
+        horizon=4,
+    )
+    return x, reference
+
+
+def horizon_by_hand(model, mode, config, x):
+    """Free response and forced response of the states over the horizon, by stepping in numpy."""
+    A, B = np.asarray(model.A[mode]), np.asarray(model.B[mode])
+    k, hold = config.horizon, round(config.model_dt / DT)
+
+    def run(z, plan):
+        states = []
+        for u in plan:
+            for _ in range(hold):
+                z = A @ z + B @ u
+            states.append(z[1:7])
+        return np.concatenate(states)
+
+    free = run(np.asarray(lift(x)), np.zeros((k, 4)))
+    columns = [run(np.zeros(len(A)), e.reshape(k, 4)) for e in np.eye(4 * k)]
+    return free, np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("mode", [Mode.TROT, Mode.STAND])
+def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, free, model, start):
+    """The finite-horizon LQ problem as one weighted least-squares problem, by numpy."""
+    x, reference = start
+    plan = solve(free, jnp.asarray(int(mode)), lift(x), reference, jnp.zeros(16), config=FREE)
+    assert plan.status == Status.SOLVED
+    response, forced = horizon_by_hand(model, mode, FREE, x)
+    Q, R = np.tile(FREE.state_weights, 4), np.full(16, FREE.input_weight)
+    hover = np.tile([0.0, MASS * G / MODE_ALPHA[mode].sum()], 8)
+    rows = np.concatenate([np.sqrt(Q)[:, None] * forced, np.diag(np.sqrt(R))])
+    wanted = np.concatenate([np.sqrt(Q) * (reference.ravel() - response), np.sqrt(R) * hover])
+    u = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    assert np.abs(u).max() > 20.0
+    # Rounding 2e-16 times the condition of H, 1e5, times forces of 1e3 N.
+    np.testing.assert_allclose(plan.x, u, rtol=0, atol=2e-8)
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+@pytest.mark.parametrize("name", ["float32", "float64"])
+def test_plans_respect_the_bounds_and_swing_legs_get_exactly_no_force(mode, name, bounded, start):
+    config = LmpcConfig(horizon=4, model_dt=0.005, force_z_min=5.0)  # default tolerance
+    tables = cast(bounded, name)
+    for scale in (1.0, 30.0):  # the larger disturbance drives every force to a bound
+        x, reference = (jnp.asarray(a, name) for a in start)
+        z = lift(scale * (x - reference[0]) + reference[0])
+        solution = solve(tables, jnp.asarray(int(mode)), z, reference, 0 * tables.lower[0], config)
+        assert solution.status == Status.SOLVED
+        forces = np.asarray(solution.x).reshape(4, 2, 2)
+        for end, standing in enumerate(MODE_ALPHA[mode] > 0):
+            if not standing:
+                np.testing.assert_array_equal(forces[:, end], 0.0)
+                continue
+            assert (np.abs(forces[:, end, 0]) <= 60.0).all()
+            assert (forces[:, end, 1] >= 5.0).all()
+            assert (forces[:, end, 1] <= 160.0).all()
+    if mode != Mode.FLIGHT:
+        assert np.isin(np.abs(forces), [5.0, 60.0, 160.0]).any()
+
+
+def test_tables_hold_the_model_over_one_model_step(bounded, model):
+    expected = jax.jit(jax.vmap(partial(models.aggregate, steps=5)))(model)
+    # The same products, fused differently: rounding of entries of order one.
+    chex.assert_trees_all_close(bounded.model, expected, rtol=0, atol=1e-13)
+
+
+def test_contact_points_make_no_difference_to_a_model_that_ignores_them(bounded, start):
+    x, reference = start
+    arguments = (bounded, jnp.asarray(int(Mode.TROT)), lift(x), reference, jnp.zeros(16))
+    offline = solve(*arguments, config=BOUNDED)
+    online = solve(*arguments, config=BOUNDED, feet=jnp.array([[0.1, -0.2], [-0.3, -0.4]]))
+    assert offline.status == online.status == Status.SOLVED
+    # The same iterations but for rounding: 2e-16 times condition 1e5 times forces of 1e2 N.
+    np.testing.assert_allclose(online.x, offline.x, rtol=0, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def measured(fitted_moving_feet, body):
+    return build(fitted_moving_feet[0], config=BOUNDED, data_dt=DT, mass=MASS, feet=body.feet)
+
+
+@pytest.mark.parametrize("mode", [Mode.FRONT, Mode.TROT, Mode.STAND])
+def test_measured_contact_points_at_their_nominal_place_give_the_tables_plan(
+    mode, measured, body, start
+):
+    x, reference = start
+    arguments = (measured, jnp.asarray(int(mode)), lift(x), reference, jnp.zeros(16))
+    offline = solve(*arguments, config=BOUNDED)
+    online = solve(*arguments, config=BOUNDED, feet=body.feet)
+    assert offline.status == online.status == Status.SOLVED
+    # As above: rounding seen through the condition.
+    np.testing.assert_allclose(online.x, offline.x, rtol=0, atol=1e-8)
+
+
+def test_a_foot_further_forward_takes_less_of_the_weight_to_hold_the_pitch(measured, body):
+    """Statics: level and at rest, the two vertical forces balance their moments about the CoM."""
+    x = jnp.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0])
+    reference = jnp.tile(x, (4, 1))
+    shares = []
+    for shift in (-0.05, 0.0, 0.05):
+        feet = body.feet.at[0, 0].add(shift)
+        arguments = (measured, jnp.asarray(int(Mode.TROT)), lift(x), reference, jnp.zeros(16))
+        force = solve(*arguments, config=BOUNDED, feet=feet).x[:4]
+        shares.append(float(force[1] / (force[1] + force[3])))
+    assert shares[0] > shares[1] > shares[2]
+
+
+def test_plans_of_a_batch_with_mixed_modes_equal_single_plans(bounded, start):
+    x, reference = start
+    batch = jax.jit(
+        jax.vmap(
+            lambda mode, z: lmpc.solve_lmpc(bounded, mode, z, reference, jnp.zeros(16), BOUNDED),
+            in_axes=(0, 0),
+        )
+    )
+    states = jnp.stack([x + 0.01 * i for i in range(5)])
+    plans = batch(jnp.arange(5), jax.vmap(lift)(states))
+    for mode in Mode:
+        single = solve(
+            bounded, jnp.asarray(int(mode)), lift(states[mode]), reference, jnp.zeros(16), BOUNDED
+        )
+        assert plans.status[mode] == single.status == Status.SOLVED
+        # As above: rounding seen through the condition.
+        np.testing.assert_allclose(plans.x[mode], single.x, rtol=0, atol=1e-8)
+
+
+def test_changing_mode_and_state_traces_once(bounded, start):
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def plan(mode, x):
+        return lmpc.solve_lmpc(bounded, mode, lift(x), start[1], jnp.zeros(16), BOUNDED)
+
+    results = [plan(jnp.asarray(int(mode)), start[0]) for mode in Mode]
+    chex.assert_trees_all_equal_shapes_and_dtypes(*results)
+
+
+def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
+    """Closed loop on the exact dynamics: pitch and height come back within a second."""
+    alpha = jnp.asarray(MODE_ALPHA[Mode.STAND], float)
+    reference = jnp.tile(jnp.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0]), (4, 1))
+
+    def tick(carry, _):
+        x, warm = carry
+        plan = lmpc.solve_lmpc(
+            bounded, jnp.asarray(int(Mode.STAND)), lift(x), reference, warm, BOUNDED
+        )
+        for _ in range(5):
+            x = srb.rk4_step(body, alpha, x, plan.x[:4], DT)
+        return (x, lmpc.shift_plan(plan.x, BOUNDED)), (x, plan.status)
+
+    x0 = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
+    _, (states, status) = jax.jit(lambda carry: jax.lax.scan(tick, carry, length=200))(
+        (x0, jnp.zeros(16))
+    )
+    np.testing.assert_array_equal(status, Status.SOLVED)
+    # 0.1 rad shrinks fivefold; the input weight on the absolute force leaves a droop in height.
+    assert abs(states[-1, 2]) < 0.02
+    assert abs(states[-1, 1] - 0.27) < 0.015
+    assert np.abs(states[-1, 3:]).max() < 0.05
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_the_hover_reference_carries_the_weight(mode):
+    lower, upper, reference = (
+        np.asarray(a)[mode].reshape(2, 2) for a in lmpc.force_bounds(FREE, MASS)
+    )
+    net = MODE_ALPHA[mode] @ reference
+    weight = 0.0 if mode == Mode.FLIGHT else MASS * G
+    np.testing.assert_allclose(net, [0.0, weight], rtol=1e-15)  # one rounding of the division
+    standing = MODE_ALPHA[mode] > 0
+    np.testing.assert_array_equal(lower[~standing], 0.0)
+    np.testing.assert_array_equal(upper[~standing], 0.0)
+    np.testing.assert_array_equal(lower[standing], -np.inf)
+    np.testing.assert_array_equal(upper[standing], np.inf)
+
+
+def test_the_zero_input_reference_is_the_default():
+    np.testing.assert_array_equal(lmpc.force_bounds(LmpcConfig(), MASS)[2], 0.0)
+
+
+def test_the_reference_walks_ahead_at_the_commanded_velocity(dtype):
+    reference = reference_trajectory(
+        position=jnp.asarray(1.0, dtype),
+        height=jnp.asarray(0.3, dtype),
+        velocity=jnp.asarray(-0.5, dtype),
+        model_dt=0.02,
+        horizon=3,
+    )
+    assert reference.dtype == dtype
+    expected = [[1.0 - 0.01 * i, 0.3, 0.0, -0.5, 0.0, 0.0] for i in (1, 2, 3)]
+    np.testing.assert_allclose(reference, expected, rtol=2 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize(
+    ("control_dt", "order"),
+    [(0.005, [1, 2, 3, 3]), (0.010, [2, 3, 3, 3]), (0.001, [0, 1, 2, 3]), (1.0, [3, 3, 3, 3])],
+)
+def test_shifting_a_plan_drops_what_has_passed_and_repeats_its_end(control_dt, order):
+    config = LmpcConfig(horizon=4, model_dt=0.005, control_dt=control_dt)
+    plan = jnp.arange(16.0)
+    shifted = np.asarray(lmpc.shift_plan(plan, config)).reshape(4, 4)
+    np.testing.assert_array_equal(shifted, np.arange(16.0).reshape(4, 4)[order])
+
+
+def test_shifting_a_plan_of_one_step_keeps_it():
+    plan = jnp.arange(4.0)
+    np.testing.assert_array_equal(lmpc.shift_plan(plan, LmpcConfig(horizon=1)), plan)
