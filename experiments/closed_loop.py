@@ -54,6 +54,7 @@ def main() -> None:
         simulation = build_simulation(config)
     except ConfigError as error:
         cli.fail(str(error))
+    print(f"models fitted, controller compiled: {time.perf_counter() - clock:.1f} s", flush=True)
     if args.seeds is None:
         run = _simulate_with_bar(simulation, config, view=args.view)
         result = metrics(run, config)

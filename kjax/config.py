@@ -146,6 +146,8 @@ class LmpcConfig:
     """Upper bound of F_z per leg, body frame [N]."""
     height: Positive = 0.27
     """Reference height of the centre of mass above ground [m]."""
+    command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
+    """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
     position_slack: Positive = 0.10
     """Largest lead or lag of the integrated position reference before the body [m]."""
     solver: Literal["admm", "projected_gradient"] = "admm"

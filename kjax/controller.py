@@ -34,6 +34,7 @@ class ControllerParams(NamedTuple):
       swing: swing settings.
       command: forward velocity over time.
       height: reference height of the centre of mass [m].
+      command_slew: largest rate of change of the reference velocity [m/s^2].
       position_slack: clamp of the position reference [m].
     """
 
@@ -44,6 +45,7 @@ class ControllerParams(NamedTuple):
     swing: swing.SwingParams
     command: Command
     height: Float[Array, ""]
+    command_slew: Float[Array, ""]
     position_slack: Float[Array, ""]
 
 
@@ -56,6 +58,7 @@ class ControllerState(NamedTuple):
       stance: (4,) scheduled stance legs.
       position: integrated reference of p_x [m].
       velocity_command: velocity commanded now [m/s].
+      velocity: reference of v_x, which follows the command at a bounded rate [m/s].
       plan: (4k,) last force plan, body frame [N].
       force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
       swing: state of the swing legs.
@@ -66,6 +69,7 @@ class ControllerState(NamedTuple):
     stance: Bool[Array, "4"]
     position: Float[Array, ""]
     velocity_command: Float[Array, ""]
+    velocity: Float[Array, ""]
     plan: Float[Array, "nu"]
     force: Float[Array, "4 2"]
     swing: swing.SwingState
@@ -137,6 +141,7 @@ def build_controller(config: RunConfig) -> Controller:
             stance=jnp.ones((4,), bool),
             position=body.x[0],
             velocity_command=zero,
+            velocity=zero,
             plan=jnp.zeros_like(params.tables.lower[0]),
             force=jnp.zeros((4, 2), zero.dtype),
             swing=swing.initial_swing(body.feet),
@@ -160,14 +165,16 @@ def build_controller(config: RunConfig) -> Controller:
         swings = swings._replace(held=swings.held & ~stance)
 
         command = _command_at(params.command, state.time)
+        change = params.command_slew * lmpc.control_dt
+        velocity = state.velocity + jnp.clip(command - state.velocity, -change, change)
         slack = params.position_slack
         position = jnp.clip(
-            state.position + command * lmpc.control_dt, body.x[0] - slack, body.x[0] + slack
+            state.position + velocity * lmpc.control_dt, body.x[0] - slack, body.x[0] + slack
         )
         reference = reference_trajectory(
             position=position,
             height=params.height,
-            velocity=command,
+            velocity=velocity,
             model_dt=lmpc.model_dt,
             horizon=lmpc.horizon,
         )
@@ -193,6 +200,7 @@ def build_controller(config: RunConfig) -> Controller:
             stance=stance,
             position=jnp.where(readable, position, state.position),
             velocity_command=command,
+            velocity=velocity,
             plan=forces,
             force=forces[:4].reshape(2, 2)[LEG_PAIR] * stance[:, None],
             swing=jax.tree.map(lambda new, old: jnp.where(readable, new, old), swings, state.swing),
@@ -231,7 +239,7 @@ def build_controller(config: RunConfig) -> Controller:
             body,
             jnp.maximum(swings.duration - swings.elapsed, 0.0),
             params.schedule.stance_time[where],
-            state.velocity_command,
+            state.velocity,
         )
         target = jnp.stack([x_target, jnp.full_like(x_target, robot.foot_radius)], axis=-1)
         position, velocity = swing.foot_reference(params.swing, swings, target)
@@ -301,6 +309,7 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
                 velocities=jnp.asarray(config.command.velocities),
             ),
             height=jnp.asarray(config.lmpc.height),
+            command_slew=jnp.asarray(config.lmpc.command_slew, float),
             position_slack=jnp.asarray(config.lmpc.position_slack),
         )
         params = jax.device_get(params)

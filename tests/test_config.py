@@ -35,6 +35,7 @@ def message(overrides, cls=RunConfig, path=None):
         ({"lmpc.force_z_min": 200.0}, ("lmpc", "force_z_min", "200.0", "160.0")),
         ({"lmpc.model_dt": 0.0015}, ("lmpc.model_dt", "multiple", "0.0015")),
         ({"lmpc.control_dt": 0.0004}, ("lmpc.control_dt", "multiple", "0.0004")),
+        ({"lmpc.command_slew": 0.0}, ("lmpc.command_slew", "greater than 0")),
         ({"command.times": [0.0, 1.0]}, ("command", "equally long", "2", "5")),
         ({"command.times": [0, 3, 2, 4, 5]}, ("command", "increase")),
         ({"lmpc.state_weights": [1.0, 2.0]}, ("lmpc.state_weights", "[1.0, 2.0]")),

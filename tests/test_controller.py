@@ -170,6 +170,18 @@ def test_trot_swaps_diagonals_every_stance_time(controller, params, plan):
     assert pattern == ([True] * 50 + [False] * 50) * 2
 
 
+def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller, params, plan):
+    stepped = params._replace(command=params.command._replace(velocities=jnp.full(5, 0.4)))
+    state = controller.init(stepped, standing())
+    velocities = []
+    for _ in range(30):
+        state, _ = plan(stepped, state, standing())
+        velocities.append(float(state.velocity))
+    # 4 m/s^2 at 200 Hz: 0.02 m/s a tick, 0.4 m/s after 20 of them
+    np.testing.assert_allclose(velocities, np.minimum(0.02 * np.arange(1, 31), 0.4), atol=1e-12)
+    assert float(state.velocity_command) == 0.4
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_non_finite_observation_is_reported_and_spreads_nowhere(
     controller, params, plan, act, bad

@@ -98,7 +98,7 @@ def foothold(
     body: PlanarState,
     remaining: Float[Array, "4"],
     stance_time: Float[Array, "4"],
-    velocity_command: Float[Array, ""],
+    velocity: Float[Array, ""],
 ) -> Float[Array, "4"]:
     """World x of each leg's next foothold [m]: Raibert's law.
 
@@ -110,13 +110,11 @@ def foothold(
       body: sagittal state.
       remaining: (4,) time to touchdown [s].
       stance_time: (4,) length of the stance to come [s].
-      velocity_command: commanded forward velocity [m/s].
+      velocity: forward velocity wanted [m/s].
     """
     v = body.x[3]
     hips = body.base[0] + robot.hip_pos[:, ::2] @ body.rotation[0]
-    return (
-        hips + v * (remaining + 0.5 * stance_time) + params.velocity_gain * (v - velocity_command)
-    )
+    return hips + v * (remaining + 0.5 * stance_time) + params.velocity_gain * (v - velocity)
 
 
 def foot_reference(

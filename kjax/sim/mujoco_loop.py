@@ -131,7 +131,7 @@ def build_simulation(config: RunConfig) -> Simulation:
     example = jax.ShapeDtypeStruct((cuts[-1] + NOISE_DIM,), dtype)
     state_like = jax.eval_shape(lambda sensed: controller.init(params, sense(sensed)), example)
     _, log_like = jax.eval_shape(plan_log, state_like, example)
-    return Simulation(
+    simulation = Simulation(
         config=config,
         model=model,
         addresses=resolve(model),
@@ -143,6 +143,11 @@ def build_simulation(config: RunConfig) -> Simulation:
         act=jax.jit(act),
         unpack_log=lambda flat: jax.device_get(jax.vmap(lambda one: unpack(one, log_like))(flat)),
     )
+    # Compile here, so that the loop's first tick is like its others; the results are dropped.
+    sensed = np.zeros(example.shape)
+    state = simulation.init(sensed)
+    jax.block_until_ready((simulation.plan(state, sensed), simulation.act(state, sensed)))
+    return simulation
 
 
 def simulate(
@@ -184,8 +189,6 @@ def simulate(
     actuators, trunk = at.actuator.reshape(-1), model.body("trunk").id
 
     state = simulation.init(sense(0))
-    # Compile outside the timed loop; the results are dropped.
-    jax.block_until_ready((simulation.plan(state, sensed), simulation.act(state, sensed)))
 
     fell = interrupted = False
     done = 0

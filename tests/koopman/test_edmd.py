@@ -195,11 +195,12 @@ def test_a_batched_fit_equals_single_fits(fitted, snapshots):
         assert report.rank == fitted[1].rank[mode]
 
 
+@pytest.mark.parametrize("when", [4, -1])  # the last state is a target only, no regressor
 def test_data_that_is_not_finite_is_reported_and_spoils_its_own_mode_only(
-    fit_modes, fitted, snapshots
+    fit_modes, fitted, snapshots, when
 ):
     states = np.array(snapshots.states)
-    states[Mode.REAR, 3, 4, 5] = np.nan
+    states[Mode.REAR, 3, when, 5] = np.nan
     model, report = fit_modes()(snapshots._replace(states=states))
     expected = np.arange(5) != Mode.REAR
     np.testing.assert_array_equal(report.finite, expected)

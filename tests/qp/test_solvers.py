@@ -267,7 +267,8 @@ def test_faulty_data_gets_its_status_and_a_finite_point(random_qp, method, dtype
     data = dict(zip(("H", "q", "lower", "upper"), random_qp(0)[:4], strict=True))
     for name, change in changes.items():
         data[name] = change(data[name])
-    solution = solve(*cast(data.values(), dtype), method=method, tolerance=TOLERANCE[dtype.name])
+    options = {"method": method, "tolerance": TOLERANCE[dtype.name]}
+    solution = solve(*cast(data.values(), dtype), np.full(N, 0.3, dtype), **options)
     assert solution.status == status
     assert solution.iterations == 0
     assert np.isinf(solution.residual)

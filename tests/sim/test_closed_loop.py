@@ -11,7 +11,12 @@ from kjax.robots import go1
 from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics, sensor_noise
 from kjax.sim.mujoco_loop import build_simulation, simulate
 
-SHORT = {"duration": 1.5, "command.times": [0.0, 0.5], "command.velocities": [0.0, 0.2]}
+SHORT = {
+    "duration": 1.5,
+    "command.times": [0.0, 0.5],
+    "command.velocities": [0.0, 0.2],
+    "lmpc.command_slew": np.inf,
+}
 
 
 @pytest.fixture(scope="module")
