@@ -34,10 +34,10 @@ def main() -> None:
     chosen = jnp.asarray(list(MODES.values()))
 
     @jax.jit
-    def study(scale: jax.Array) -> tuple[Any, ErrorStatistics]:
+    def study(key: jax.Array, scale: jax.Array) -> tuple[Any, ErrorStatistics]:
         """Fit and test on ranges shrunk by ``scale``."""
         ranges = shrink(ranges_from_config(data, vary_feet=koopman.feet == "measured"), scale)
-        model, report = fit_modes(body, koopman, ranges=ranges)
+        model, report = fit_modes(body, koopman, key, ranges=ranges)
 
         def test(mode: jax.Array, alpha: jax.Array) -> ErrorStatistics:
             still: SampleRanges = ranges._replace(feet_half=jnp.zeros(2))
@@ -59,7 +59,8 @@ def main() -> None:
 
         return report, jax.vmap(test)(chosen, jnp.asarray(MODE_ALPHA, float)[chosen])
 
-    report, statistics = jax.device_get(study(jnp.asarray(1.0)))
+    key = jax.random.key(data.seed)
+    report, statistics = jax.device_get(study(key, jnp.asarray(1.0)))
     if not report.finite.all():
         cli.fail("the fit is not finite: check srb and koopman.dataset ranges")
     result: dict[str, Any] = {"fit": {}, "error_at_end": {}, "largest_scale_within_tolerance": {}}
@@ -95,7 +96,7 @@ def main() -> None:
     print(f"\nlargest fraction of those ranges for which the statistic stays within "
           f"{config.tolerance:g} in all six states")  # fmt: skip
     print("  " + " " * 10 + "".join(f"{key:>12}" for key in STATISTICS))
-    scan = {s: jax.device_get(study(jnp.asarray(s)))[1] for s in sorted(config.scales)}
+    scan = {s: jax.device_get(study(key, jnp.asarray(s)))[1] for s in sorted(config.scales)}
     for i, name in enumerate(MODES):
         best = {key: _largest_scale(scan, key, i, config.tolerance) for key in STATISTICS}
         result["largest_scale_within_tolerance"][name] = best

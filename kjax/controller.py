@@ -282,7 +282,9 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
     leg = config.leg
     with jax.enable_x64(True):
         body = srb_params(config.srb)
-        model, report = _fit_modes(body, config=config.koopman)
+        model, report = _fit_modes(
+            body, config.koopman, jax.random.key(config.koopman.dataset.seed)
+        )
         if not bool(report.finite.all()):
             raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
         params = ControllerParams(

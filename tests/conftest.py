@@ -23,11 +23,10 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # Shapes and dtypes of annotated arguments are checked in tests only, so before kjax is imported.
 CHECKED = (
     "kjax.srb",
-    "kjax.koopman.dataset",
-    "kjax.koopman.models",
-    "kjax.koopman.observables",
+    "kjax.koopman",
     "kjax.qp",
     "kjax.mpc",
+    "kjax.gait",
     "kjax.legs",
 )
 install_import_hook(CHECKED, "beartype.beartype")

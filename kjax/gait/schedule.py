@@ -98,7 +98,7 @@ def _timing(gait: list[Phase], index: int) -> tuple[list[float], list[float]]:
         first = next((k for k, phase in enumerate(ahead) if phase.stance[leg]), None)
         if first is None:
             raise ValueError(f"leg {leg} never stands in this gait")
-        wait.append(sum(phase.duration for phase in ahead[:first]))
+        wait.append(sum((phase.duration for phase in ahead[:first]), 0.0))
         stance.append(_stance_length(gait, leg, index + first))
     return wait, stance
 
@@ -107,7 +107,7 @@ def _stance_length(gait: list[Phase], leg: int, index: int) -> float:
     """Length of the unbroken stance of ``leg`` that contains phase ``index`` of the cycle."""
     n = len(gait)
     if all(phase.stance[leg] for phase in gait):
-        return sum(phase.duration for phase in gait)
+        return sum((phase.duration for phase in gait), 0.0)
     begin = index
     while gait[(begin - 1) % n].stance[leg]:
         begin -= 1

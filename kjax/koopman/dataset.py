@@ -87,18 +87,15 @@ def sample(
       dt: Runge-Kutta step [s].
       hold: number of steps per random force.
     """
-    key_state, key_input, key_feet = jax.random.split(key, 3)
-    x0 = ranges.state_centre + ranges.state_half * jax.random.uniform(
-        key_state, (rollouts, 6), minval=-1.0, maxval=1.0
-    )
+    # One draw for everything: each call of the generator costs seconds of compilation.
     pieces = -(-steps // hold)
-    inputs = jax.random.uniform(
-        key_input, (rollouts, pieces, 4), minval=ranges.input_low, maxval=ranges.input_high
-    )
+    draw = jax.random.uniform(key, (rollouts, 6 + 4 + 4 * pieces), minval=-1.0, maxval=1.0)
+    x0 = ranges.state_centre + ranges.state_half * draw[:, :6]
+    feet = params.feet + ranges.feet_half * draw[:, 6:10].reshape(rollouts, 2, 2)
+    middle = 0.5 * (ranges.input_low + ranges.input_high)
+    half = 0.5 * (ranges.input_high - ranges.input_low)
+    inputs = middle + half * draw[:, 10:].reshape(rollouts, pieces, 4)
     inputs = jnp.repeat(inputs, hold, axis=1)[:, :steps]
-    feet = params.feet + ranges.feet_half * jax.random.uniform(
-        key_feet, (rollouts, 2, 2), minval=-1.0, maxval=1.0
-    )
 
     def one(x0: Array, inputs: Array, feet: Array) -> Array:
         return srb.rollout(params._replace(feet=feet), alpha, x0, inputs, dt)

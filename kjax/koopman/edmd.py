@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from kjax import srb
 from kjax.config import KoopmanConfig, SrbConfig
@@ -59,7 +59,7 @@ def regressors(
 
 def least_squares(
     Z: Float[Array, "M columns"], Y: Float[Array, "M N"]
-) -> tuple[Float[Array, "columns N"], Float[Array, ""], Float[Array, "columns"]]:
+) -> tuple[Float[Array, "columns N"], Int[Array, ""], Float[Array, "columns"]]:
     """Minimum-norm solution W of Z W = Y in the scaled columns, its rank and singular values."""
     norm = jnp.linalg.norm(Z, axis=0)
     scale = jnp.where(norm > 0, norm, 1.0)
@@ -124,13 +124,19 @@ def srb_params(config: SrbConfig) -> srb.SrbParams:
 
 
 def fit_modes(
-    body: srb.SrbParams, config: KoopmanConfig, *, ranges: SampleRanges | None = None
+    body: srb.SrbParams,
+    config: KoopmanConfig,
+    key: PRNGKeyArray,
+    *,
+    ranges: SampleRanges | None = None,
 ) -> tuple[LinearModel, FitReport]:
     """One model per contact mode from random rollouts, all modes in one vmapped call.
 
     Args:
       body: parameters of the rigid body.
       config: dictionary, dataset and kind of contact points.
+      key: random key, usually of ``config.dataset.seed``; an argument, since XLA would evaluate
+        the whole data set of a constant one while it compiles.
       ranges: sampling ranges in place of the config's.
 
     Returns:
@@ -154,5 +160,5 @@ def fit_modes(
         )
         return fit(dictionary, snapshots, feet_terms=vary_feet)
 
-    keys = jax.random.split(jax.random.key(data.seed), len(MODE_ALPHA))
+    keys = jax.random.split(key, len(MODE_ALPHA))
     return jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA, float))

@@ -162,7 +162,11 @@ def solve(
     )
     status = jnp.where(good & ~(error <= tolerance), Status.ITERATION_LIMIT, fault)
     # Where the data is faulty the point is the start, inside whatever bounds make sense.
-    fallback = jnp.clip(start, jnp.nan_to_num(lower, nan=0.0), jnp.nan_to_num(upper, nan=0.0))
+    low, high = (
+        jnp.where(jnp.isnan(bound) | (bound == absurd), 0.0, bound)
+        for bound, absurd in ((lower, jnp.inf), (upper, -jnp.inf))
+    )
+    fallback = jnp.clip(start, low, high)
     x = jnp.where(good, jnp.clip(best * d, lower, upper), fallback)
     return Solution(
         x=x,

@@ -232,7 +232,9 @@ def test_every_figure_of_the_report_is_a_number_even_for_data_of_zeros(fit_modes
 
 def test_fit_modes_stacks_models_over_all_contact_modes(body):
     config = KoopmanConfig(order=1, dataset=DatasetConfig(rollouts=10, duration=0.01))
-    model, report = jax.jit(edmd.fit_modes, static_argnames="config")(body, config)
+    model, report = jax.jit(edmd.fit_modes, static_argnames="config")(
+        body, config, jax.random.key(0)
+    )
     assert model.A.shape == (len(Mode), 9, 9)
     assert np.asarray(report.finite).all()
     moment = np.asarray(model.B[:, 6])
