@@ -27,6 +27,10 @@ TABLE = (
     ("velocity_rmse_mps", "velocity RMSE [m/s]", ".4f"),
     ("pitch_max_deg", "pitch, largest [deg]", ".2f"),
     ("pitch_p95_deg", "pitch, 95 % [deg]", ".2f"),
+    ("field_pitch_p95_deg", "pitch in the field, 95 % [deg]", ".2f"),
+    ("switch_time_s", "gait switched at [s]", ".3f"),
+    ("switch_pitch_max_deg", "pitch after it, largest [deg]", ".2f"),
+    ("pitch_settle_s", "pitch settled after [s]", ".3f"),
     ("height_mean_m", "CoM height, mean [m]", ".3f"),
     ("foot_slip_m", "foot slip per stance [m]", ".4f"),
     ("torque_saturation_fraction", "time with a saturated joint [-]", ".4f"),
@@ -61,7 +65,7 @@ def main() -> None:
         cli.save_json(folder / "metrics.json", result)
         print_table([result])
     else:
-        run = run_seeds(simulation, config, args.seeds, folder)
+        run, config = run_seeds(simulation, config, args.seeds, folder)
     if run is not None:
         save_run(run, config, folder, args)
     print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
@@ -97,7 +101,9 @@ def _simulate_with_bar(
                 bar.update(done * config.sim.sim_dt - bar.n)
 
         if not view:
-            return simulate(simulation, seed=config.seed, on_tick=on_tick)
+            return simulate(
+                simulation, seed=config.seed, terrain_seed=config.terrain.seed, on_tick=on_tick
+            )
         return _simulate_in_viewer(simulation, config, on_tick)
 
 
@@ -127,7 +133,9 @@ def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTi
             time.sleep(ahead)
 
     try:
-        return simulate(simulation, seed=config.seed, on_tick=show)
+        return simulate(
+            simulation, seed=config.seed, terrain_seed=config.terrain.seed, on_tick=show
+        )
     finally:
         if viewer is not None:
             viewer.close()
@@ -135,11 +143,15 @@ def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTi
 
 def run_seeds(
     simulation: Simulation, config: RunConfig, count: int, folder: Path
-) -> Trajectory | None:
-    """Run seeds, each saved as it ends; returns the first run of this call."""
+) -> tuple[Trajectory | None, RunConfig]:
+    """Run seeds, each saved as it ends; returns the first run of this call and its config.
+
+    Each seed is one of noise and, where there are obstacles, of their field as well.
+    """
     path = folder / "seeds.json"
     record = cli.provenance()
     plain = {key: value for key, value in to_dict(config).items() if key != "seed"}
+    del plain["terrain"]["seed"]
     label = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
     label += "@" + record["git_revision"]
     done: dict[str, Any] = {}
@@ -149,16 +161,18 @@ def run_seeds(
             print(f"{path}: other config or revision; starting afresh")
         else:
             done = old["seeds"]
-    first = None
+    first, first_config = None, config
     for seed in range(config.seed, config.seed + count):
         if str(seed) in done:
             continue
-        this = dataclasses.replace(config, seed=seed)
+        field = dataclasses.replace(config.terrain, seed=seed)
+        this = dataclasses.replace(config, seed=seed, terrain=field)
         run = _simulate_with_bar(simulation, this, label=f"seed {seed}")
         if run.interrupted:
             print(f"stopped in seed {seed}; run the same command again to go on")
-            return run
-        first = first or run
+            return run, this
+        if first is None:
+            first, first_config = run, this
         done[str(seed)] = metrics(run, this)
         chosen = [done[k] for k in done]
         cli.save_json(
@@ -166,15 +180,17 @@ def run_seeds(
         )
     results = [done[str(s)] for s in range(config.seed, config.seed + count)]
     print_table(results)
-    return first
+    return first, first_config
 
 
 def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
     """Median and worst of each metric over runs that did not fall, and the number of falls."""
     upright = [r for r in results if not r["fell"]]
     out: dict[str, Any] = {"runs": len(results), "falls": len(results) - len(upright)}
+    if any("crossed" in r for r in results):
+        out["crossed"] = sum(r.get("crossed", False) for r in results)
     for key, _, _ in TABLE:
-        values = [r[key] for r in upright if key in r]
+        values = [r[key] for r in upright if r.get(key) is not None]
         if values:
             worst = min(values) if key in LOWER_IS_WORSE else max(values)
             out[key] = {"median": float(np.median(values)), "worst": worst}
@@ -190,6 +206,9 @@ def print_table(results: list[dict[str, Any]]) -> None:
         if key in total:
             median, worst = (format(total[key][k], form) for k in ("median", "worst"))
             print(f"{name:34}{median:>10}" + (f"{worst:>10}" if several else ""))
+    crossed = [result["crossed"] for result in results if "crossed" in result]
+    if crossed:
+        print(f"{'crossed the field':34}{sum(crossed):>7}/{len(crossed)}")
     for result in results:
         if result["fell"]:
             print(f"FELL at {result['fall_time_s']:.2f} s")

@@ -40,13 +40,14 @@ def main() -> None:
         model, report = fit_modes(body, koopman, key, ranges=ranges)
 
         def test(mode: jax.Array, alpha: jax.Array) -> ErrorStatistics:
+            here = jax.tree.map(lambda leaf: leaf[mode], body)
             still: SampleRanges = ranges._replace(feet_half=jnp.zeros(2))
             return summarise(
                 prediction_errors(
                     jax.random.fold_in(jax.random.key(config.test_seed), mode),
                     jax.tree.map(lambda leaf: leaf[mode], model),
                     dictionary,
-                    body,
+                    here,
                     alpha,
                     still,
                     states=config.test_states,

@@ -146,6 +146,8 @@ class LmpcConfig:
     """Upper bound of F_z per leg, body frame [N]."""
     height: Positive = 0.27
     """Reference height of the centre of mass above ground [m]."""
+    height_above: Literal["ground", "feet"] = "ground"
+    """What the reference height is measured from: z = 0, or the stance feet (rough ground) [-]."""
     command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
     """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
     position_slack: Positive = 0.10
@@ -167,14 +169,89 @@ class LmpcConfig:
         return self
 
 
+GaitName = Literal["trot", "bound", "stand"]
+
+
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class GaitConfig:
-    """Which legs stand when."""
+    """Which gait when."""
 
-    name: Literal["trot", "stand"] = "trot"
-    """Gait to walk in [-]."""
+    names: tuple[GaitName, ...] = ("trot",)
+    """Gaits to walk in, one after the other [-]."""
+    times: tuple[NonNegative, ...] = (0.0,)
+    """When each of them is asked for, increasing, the first one 0 [s]."""
     stance_time: Positive = 0.25
-    """Duration of each trot phase, stance of one diagonal and swing of the other [s]."""
+    """Duration of each trot stance; the other diagonal swings meanwhile [s]."""
+    trot_flight: NonNegative = 0.0
+    """Flight after each trot stance; more than 0 makes a flying trot [s]."""
+    switch_rule: Literal["flight", "anywhere"] = "flight"
+    """When a bound may be left: in the flight after front stance (Raibert), or at once [-]."""
+    landing_time: NonNegative = 0.0
+    """Four-leg stance between a bound and the next gait [s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "GaitConfig":
+        if len(self.names) != len(self.times) or not self.names:
+            raise ValueError(
+                f"names and times must be equally long and not empty, got {len(self.names)} and "
+                f"{len(self.times)}"
+            )
+        if self.times[0] != 0.0:
+            raise ValueError(f"times must start at 0, got {list(self.times)}")
+        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError(f"times must increase, got {list(self.times)}")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class BoundConfig:
+    """The bound: timing, feet, reference, and its own LMPC weights and bounds."""
+
+    front_stance: Positive = 0.1
+    """Duration of the front stance [s]."""
+    first_flight: Positive = 0.1
+    """Duration of the flight after it [s]."""
+    rear_stance: Positive = 0.05
+    """Duration of the rear stance [s]."""
+    second_flight: Positive = 0.1
+    """Duration of the flight after it [s]."""
+    ramp_start: Annotated[float, Field(gt=0, le=1)] = 0.3
+    """Length of the flights in the first cycle, as a fraction of the full one [-]."""
+    ramp_cycles: Annotated[int, Field(ge=0)] = 10
+    """Number of cycles over which the flights grow to their full length [-]."""
+    feet_front: Positive = 0.075
+    """Distance of the front footholds ahead of the centre of mass, standing still [m]."""
+    feet_rear: Positive = 0.148
+    """Distance of the rear footholds behind the centre of mass, standing still [m]."""
+    reference: Literal["periodic", "constant"] = "periodic"
+    """Reference of height and pitch: the cycle's own motion, or constant (the paper) [-]."""
+    height: Positive = 0.27
+    """Mean height of the centre of mass in stance [m]."""
+    state_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (1084.0, 1211.0, 60.0, 3.06, 3.05, 0.1)
+    """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
+    input_weight: Positive = 5.7e-7
+    """R of every force [1/N^2]."""
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 51.5
+    """Bound of |F_x| per leg, body frame [N]."""
+    force_z_min: Bound = 20.0
+    """Lower bound of F_z per leg: a foot that carries no weight slips [N]."""
+    force_z_max: Bound = 300.0
+    """Upper bound of F_z per leg, body frame [N]."""
+    velocity_gain: NonNegative = 0.075
+    """Raibert gain on the velocity error in the foothold [s]."""
+    apex: Positive = 0.064
+    """Height of the swing above the higher of lift-off and target [m]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "BoundConfig":
+        if not self.force_z_min <= self.force_z_max:
+            raise ValueError(
+                f"force_z_min must not exceed force_z_max, got {self.force_z_min} and "
+                f"{self.force_z_max}"
+            )
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -197,6 +274,40 @@ class LegConfig:
     """Stiffness that holds the abduction joint of the planar robot [N m/rad]."""
     kd_abduction: NonNegative = 4.0
     """Damping of the abduction joint of the planar robot [N m s/rad]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class TerrainConfig:
+    """Obstacles on the way."""
+
+    kind: Literal["flat", "paper", "blocks", "steps", "slope", "patches"] = "flat"
+    """None; the paper's blocks, cubes and capsules; or one of ours [-]."""
+    seed: int = 0
+    """Seed of the field; independent of the noise's [-]."""
+    count: Count = 8
+    """Number of obstacles, steps or patches [-]."""
+    start: Positive = 0.8
+    """Where the field begins, measured from the robot's start [m]."""
+    end: Positive = 2.6
+    """Where it ends [m]."""
+    height_min: Positive = 0.05
+    """Lowest obstacle, or rise of a step [m]."""
+    height_max: Positive = 0.07
+    """Highest obstacle, or rise of a step [m]."""
+    slope: Annotated[float, Field(gt=0, lt=45)] = 8.0
+    """Inclination of a slope [deg]."""
+    patch_friction: Positive = 0.3
+    """Friction of a foot on a patch [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "TerrainConfig":
+        for low, high in (("start", "end"), ("height_min", "height_max")):
+            if not getattr(self, low) <= getattr(self, high):
+                raise ValueError(
+                    f"{low} must not exceed {high}, got {getattr(self, low)} and "
+                    f"{getattr(self, high)}"
+                )
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -265,10 +376,14 @@ class RunConfig:
     """Model predictive control."""
     gait: GaitConfig = GaitConfig()
     """Gait."""
+    bound: BoundConfig = BoundConfig()
+    """Bound."""
     leg: LegConfig = LegConfig()
     """Swing legs."""
     sim: SimConfig = SimConfig()
     """Physics."""
+    terrain: TerrainConfig = TerrainConfig()
+    """Terrain."""
     noise: NoiseConfig = NoiseConfig()
     """Noise."""
 
@@ -278,11 +393,25 @@ class RunConfig:
         _require_multiple(
             "lmpc.model_dt", self.lmpc.model_dt, "koopman.dataset.dt", self.koopman.dataset.dt
         )
-        if self.gait.stance_time < self.lmpc.control_dt:
-            raise ValueError(
-                f"gait.stance_time {self.gait.stance_time} s is shorter than lmpc.control_dt "
-                f"{self.lmpc.control_dt} s"
-            )
+        bound = self.bound
+        shortest = {
+            "gait.stance_time": self.gait.stance_time,
+            "bound.front_stance": bound.front_stance,
+            "bound.rear_stance": bound.rear_stance,
+            "bound.first_flight times ramp_start": bound.first_flight * bound.ramp_start,
+            "bound.second_flight times ramp_start": bound.second_flight * bound.ramp_start,
+        }
+        for name, value in (
+            ("gait.trot_flight", self.gait.trot_flight),
+            ("gait.landing_time", self.gait.landing_time),
+        ):
+            if value > 0:
+                shortest[name] = value
+        for name, value in shortest.items():
+            if value < self.lmpc.control_dt:
+                raise ValueError(
+                    f"{name} is {value} s, shorter than lmpc.control_dt {self.lmpc.control_dt} s"
+                )
         return self
 
 

@@ -11,16 +11,25 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax import gait, qp
 from kjax.config import RunConfig
+from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
 from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState, planar_state
 from kjax.legs.stance import stance_torque
-from kjax.mpc.lmpc import LmpcTables, build_tables, reference_trajectory, shift_plan, solve_lmpc
-from kjax.types import LEG_PAIR, Command, Observation, RobotParams
+from kjax.mpc.lmpc import (
+    LmpcTables,
+    build_tables,
+    mode_settings,
+    reference_trajectory,
+    shift_plan,
+    solve_lmpc,
+)
+from kjax.types import LEG_PAIR, Command, Mode, Observation, RobotParams
 
 
 class ControllerParams(NamedTuple):
@@ -30,10 +39,14 @@ class ControllerParams(NamedTuple):
       robot: geometry and masses.
       tables: LMPC per contact mode.
       schedule: gaits.
-      gait: index of the gait to start in.
+      gait_times: (K,) times at which a gait is asked for, the first one 0 [s].
+      gaits: (K,) index of the gait asked for then.
+      reference: (G, ramp levels, P, samples, 4) periodic motion of each gait; see
+        ``gait.reference``.
       swing: swing settings.
       command: forward velocity over time.
-      height: reference height of the centre of mass [m].
+      height: (G,) mean height of the centre of mass [m].
+      follow_ground: 1 to measure it from the stance feet, 0 from z = 0 [-].
       command_slew: largest rate of change of the reference velocity [m/s^2].
       position_slack: clamp of the position reference [m].
     """
@@ -41,10 +54,13 @@ class ControllerParams(NamedTuple):
     robot: RobotParams
     tables: LmpcTables
     schedule: gait.Schedule
-    gait: Int[Array, ""]
+    gait_times: Float[Array, "K"]
+    gaits: Int[Array, "K"]
+    reference: Float[Array, "G levels P samples 4"]
     swing: swing.SwingParams
     command: Command
-    height: Float[Array, ""]
+    height: Float[Array, "G"]
+    follow_ground: Float[Array, ""]
     command_slew: Float[Array, ""]
     position_slack: Float[Array, ""]
 
@@ -58,6 +74,7 @@ class ControllerState(NamedTuple):
       stance: (4,) scheduled stance legs.
       position: integrated reference of p_x [m].
       velocity_command: velocity commanded now [m/s].
+      ground: height of the ground under the last stance feet [m].
       velocity: reference of v_x, which follows the command at a bounded rate [m/s].
       plan: (4k,) last force plan, body frame [N].
       force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
@@ -69,6 +86,7 @@ class ControllerState(NamedTuple):
     stance: Bool[Array, "4"]
     position: Float[Array, ""]
     velocity_command: Float[Array, ""]
+    ground: Float[Array, ""]
     velocity: Float[Array, ""]
     plan: Float[Array, "nu"]
     force: Float[Array, "4 2"]
@@ -130,17 +148,14 @@ def build_controller(config: RunConfig) -> Controller:
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
         body = planar_state(params.robot, _cast(observation, params))
-        zero = jnp.zeros_like(params.height)
+        zero = jnp.zeros_like(params.position_slack)
         return ControllerState(
             time=zero,
-            clock=gait.Clock(
-                gait=params.gait,
-                phase=jnp.zeros_like(params.gait),
-                elapsed=zero - lmpc.control_dt,  # the first plan enters phase 0
-            ),
+            clock=gait.start(params.gaits[0], zero - lmpc.control_dt),  # first plan: phase 0
             stance=jnp.ones((4,), bool),
             position=body.x[0],
             velocity_command=zero,
+            ground=zero,
             velocity=zero,
             plan=jnp.zeros_like(params.tables.lower[0]),
             force=jnp.zeros((4, 2), zero.dtype),
@@ -155,28 +170,35 @@ def build_controller(config: RunConfig) -> Controller:
         body = planar_state(params.robot, _stand_in(observation, readable, params))
         schedule = params.schedule
 
-        clock = gait.advance(schedule, state.clock, lmpc.control_dt)
+        wanted = params.gaits[_piece(params.gait_times, state.time)]
+        clock = gait.advance(schedule, state.clock, lmpc.control_dt, wanted)
         where = (clock.gait, clock.phase)
         stance, mode = schedule.stance[where], schedule.mode[where]
         lifting = state.stance & ~stance
+        # A new gait gives legs that are in the air already another time to come down.
+        anew = ~stance & (clock.gait != state.clock.gait)
         swings = swing.begin_swings(
-            state.swing, lifting, body.feet, schedule.time_to_touchdown[where] - clock.elapsed
+            state.swing, lifting | anew, body.feet, gait.time_to_touchdown(schedule, clock)
         )
         swings = swings._replace(held=swings.held & ~stance)
 
-        command = _command_at(params.command, state.time)
+        command = params.command.velocities[_piece(params.command.times, state.time)]
         change = params.command_slew * lmpc.control_dt
         velocity = state.velocity + jnp.clip(command - state.velocity, -change, change)
         slack = params.position_slack
         position = jnp.clip(
             state.position + velocity * lmpc.control_dt, body.x[0] - slack, body.x[0] + slack
         )
+        count = jnp.sum(stance)
+        under = jnp.sum(jnp.where(stance, body.feet[:, 1] - params.robot.foot_radius, 0.0))
+        ground = jnp.where(count > 0, under / jnp.maximum(count, 1), state.ground)
+        ahead = lmpc.model_dt * jnp.arange(1, lmpc.horizon + 1, dtype=position.dtype)
         reference = reference_trajectory(
             position=position,
-            height=params.height,
             velocity=velocity,
-            model_dt=lmpc.model_dt,
-            horizon=lmpc.horizon,
+            height=params.height[clock.gait] + params.follow_ground * ground,
+            periodic=_periodic_rows(params, clock, clock.elapsed + ahead),
+            ahead=ahead,
         )
         warm = shift_plan(state.plan, lmpc)
         solution = solve_lmpc(
@@ -200,6 +222,7 @@ def build_controller(config: RunConfig) -> Controller:
             stance=stance,
             position=jnp.where(readable, position, state.position),
             velocity_command=command,
+            ground=jnp.where(readable, ground, state.ground),
             velocity=velocity,
             plan=forces,
             force=forces[:4].reshape(2, 2)[LEG_PAIR] * stance[:, None],
@@ -225,8 +248,9 @@ def build_controller(config: RunConfig) -> Controller:
         body = planar_state(robot, observation)
         where = (state.clock.gait, state.clock.phase)
 
+        settings = swing.for_gait(params.swing, state.clock.gait)
         swings = swing.continue_swings(
-            params.swing,
+            settings,
             state.swing,
             ~state.stance & readable,
             observation.contact,
@@ -235,14 +259,14 @@ def build_controller(config: RunConfig) -> Controller:
         )
         x_target = swing.foothold(
             robot,
-            params.swing,
+            settings,
             body,
             jnp.maximum(swings.duration - swings.elapsed, 0.0),
             params.schedule.stance_time[where],
             state.velocity,
         )
         target = jnp.stack([x_target, jnp.full_like(x_target, robot.foot_radius)], axis=-1)
-        position, velocity = swing.foot_reference(params.swing, swings, target)
+        position, velocity = swing.foot_reference(settings, swings, target)
         angle, rate = swing.joint_reference(robot, body, position, velocity)
         follow = swing.swing_torque(
             params.swing, observation.joint_pos, observation.joint_vel, angle, rate
@@ -278,30 +302,38 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
       dtype: floating type of the result; JAX's current default if ``None``.
     """
     dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
-    gaits = {"trot": gait.trot(config.gait.stance_time), "stand": gait.stand()}
-    leg = config.leg
+    gaits = build_gaits(config)
+    names = [g.name for g in gaits]
+    leg, bound = config.leg, config.bound
+    is_bound = np.array([name == "bound" for name in names])
+    sole = robot.foot_radius - bound.height
+    bound_feet = ((bound.feet_front, float(sole)), (-bound.feet_rear, float(sole)))
     with jax.enable_x64(True):
-        body = srb_params(config.srb)
-        model, report = _fit_modes(
-            body, config.koopman, jax.random.key(config.koopman.dataset.seed)
-        )
+        body = srb_params(config.srb, {Mode.FRONT: bound_feet, Mode.REAR: bound_feet})
+        key = jax.random.key(config.koopman.dataset.seed)
+        model, report = _fit_modes(body, config.koopman, key)
         if not bool(report.finite.all()):
             raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
         params = ControllerParams(
             robot=robot,
             tables=_build_tables(
                 model,
-                config=config.lmpc,
-                data_dt=config.koopman.dataset.dt,
-                mass=config.srb.mass,
+                mode_settings(config.lmpc, bound, config.srb.mass),
+                steps=round(config.lmpc.model_dt / config.koopman.dataset.dt),
+                horizon=config.lmpc.horizon,
                 feet=body.feet,
             ),
-            schedule=gait.build_schedule(list(gaits.values())),
-            gait=jnp.asarray(list(gaits).index(config.gait.name)),
+            schedule=gait.build_schedule(gaits),
+            gait_times=jnp.asarray(config.gait.times),
+            gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
+            reference=jnp.asarray(_reference_tables(gaits, config)),
             swing=swing.SwingParams(
-                apex=jnp.asarray(leg.apex),
+                apex=jnp.asarray(np.where(is_bound, bound.apex, leg.apex)),
+                velocity_gain=jnp.asarray(
+                    np.where(is_bound, bound.velocity_gain, leg.velocity_gain)
+                ),
+                offset=jnp.asarray(is_bound[:, None] * _bound_offset(robot, config)),
                 horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
-                velocity_gain=jnp.asarray(leg.velocity_gain),
                 hold_after=jnp.asarray(leg.hold_after),
                 kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
                 kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
@@ -310,7 +342,8 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
                 times=jnp.asarray(config.command.times),
                 velocities=jnp.asarray(config.command.velocities),
             ),
-            height=jnp.asarray(config.lmpc.height),
+            height=jnp.asarray(np.where(is_bound, bound.height, config.lmpc.height)),
+            follow_ground=jnp.asarray(float(config.lmpc.height_above == "feet")),
             command_slew=jnp.asarray(config.lmpc.command_slew, float),
             position_slack=jnp.asarray(config.lmpc.position_slack),
         )
@@ -319,7 +352,61 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
 
 
 _fit_modes = jax.jit(fit_modes, static_argnames="config")
-_build_tables = jax.jit(build_tables, static_argnames=("config", "data_dt", "mass"))
+_build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon"))
+
+
+def build_gaits(config: RunConfig) -> list[gait.Gait]:
+    """The gaits of a config, in the order of their indices: trot, bound, stand, landing."""
+    chosen, bound = config.gait, config.bound
+    landing = "landing" if chosen.landing_time > 0 else ""
+    gaits = [
+        gait.trot(chosen.stance_time, chosen.trot_flight),
+        gait.bound(
+            bound.front_stance,
+            bound.first_flight,
+            bound.rear_stance,
+            bound.second_flight,
+            ramp_start=bound.ramp_start,
+            ramp_cycles=bound.ramp_cycles,
+            leave_anywhere=chosen.switch_rule == "anywhere",
+            leave_through=landing,
+        ),
+        gait.stand(),
+    ]
+    return [*gaits, gait.stand(chosen.landing_time, name=landing)] if landing else gaits
+
+
+def _reference_tables(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
+    """Periodic motion of every gait at every ramp level; zero but for a bound that wants one."""
+    bound = config.bound
+    levels = 1 + max(g.ramp_cycles for g in gaits)
+    rows = np.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
+    for index, one in enumerate(gaits):
+        if one.name != "bound" or bound.reference != "periodic":
+            continue
+        modes = [phase.mode for phase in one.phases]
+        for level in range(levels):
+            grown = min(level / one.ramp_cycles, 1.0) if one.ramp_cycles else 1.0
+            scale = one.ramp_start + (1.0 - one.ramp_start) * grown
+            durations = [
+                phase.duration * (scale if phase.mode == Mode.FLIGHT else 1.0)
+                for phase in one.phases
+            ]
+            rows[index, level] = periodic_reference(
+                np.array(durations),
+                modes,
+                bound.feet_front,
+                bound.feet_rear,
+                config.srb.mass,
+                config.srb.inertia,
+            ).rows
+    return rows
+
+
+def _bound_offset(robot: RobotParams, config: RunConfig) -> np.ndarray:
+    """Foothold of a bound ahead of the hip, standing still, for each leg [m]."""
+    wanted = [config.bound.feet_front] * 2 + [-config.bound.feet_rear] * 2
+    return np.asarray(wanted) - np.asarray(robot.hip_pos)[:, 0]
 
 
 def _as(leaf: Any, dtype: Any) -> Array:
@@ -332,7 +419,7 @@ def _as(leaf: Any, dtype: Any) -> Array:
 
 def _cast(observation: Observation, params: ControllerParams) -> Observation:
     """Observation in the controller's floating type."""
-    dtype = params.height.dtype
+    dtype = params.position_slack.dtype
     floats = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), observation)
     return floats._replace(contact=jnp.asarray(observation.contact, bool))
 
@@ -344,7 +431,7 @@ def _all_finite(observation: Observation) -> Array:
 def _stand_in(observation: Observation, readable: Array, params: ControllerParams) -> Observation:
     """The observation, or a harmless one where it is not finite, so that no NaN spreads."""
     harmless = Observation(
-        base_pos=jnp.array([0.0, 0.0, 1.0]) * params.height,
+        base_pos=jnp.array([0.0, 0.0, 0.3]),
         base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
         base_vel=jnp.zeros(3),
         base_ang_vel=jnp.zeros(3),
@@ -359,10 +446,22 @@ def _stand_in(observation: Observation, readable: Array, params: ControllerParam
     )
 
 
-def _command_at(command: Command, time: Float[Array, ""]) -> Float[Array, ""]:
-    """Velocity commanded at ``time``; a piece begins at its start time, to within rounding."""
-    index = jnp.sum(time >= command.times - 1e-5) - 1
-    return command.velocities[jnp.maximum(index, 0)]
+def _piece(times: Float[Array, "K"], time: Float[Array, ""]) -> Int[Array, ""]:
+    """Index of the piece that ``time`` lies in; it begins at its start time, within rounding."""
+    return jnp.maximum(jnp.sum(time >= times - 1e-5) - 1, 0)
+
+
+def _periodic_rows(
+    params: ControllerParams, clock: gait.Clock, elapsed: Float[Array, "k"]
+) -> Float[Array, "k 4"]:
+    """The gait's periodic motion at times since the phase began; it stops at the phase's end."""
+    levels, samples = params.reference.shape[1], params.reference.shape[3]
+    table = params.reference[clock.gait, jnp.minimum(clock.cycle, levels - 1), clock.phase]
+    place = jnp.clip(elapsed / gait.phase_duration(params.schedule, clock), 0.0, 1.0)
+    place = place * (samples - 1)
+    low = jnp.minimum(place.astype(jnp.int32), samples - 2)
+    part = (place - low)[:, None]
+    return (1.0 - part) * table[low] + part * table[low + 1]
 
 
 def _contact_points(

@@ -23,13 +23,19 @@ def refusal(capsys, *words):
 
 
 def test_any_key_can_be_overridden_by_its_dotted_name():
-    config, _ = parse("--lmpc.horizon", "9", "--gait.name=stand", "--lmpc.force_z_min", "-5.0")
-    assert (config.lmpc.horizon, config.gait.name, config.lmpc.force_z_min) == (9, "stand", -5.0)
+    config, _ = parse(
+        "--lmpc.horizon", "9", "--gait.switch_rule=anywhere", "--lmpc.force_z_min", "-5.0"
+    )
+    assert (config.lmpc.horizon, config.lmpc.force_z_min) == (9, -5.0)
+    assert config.gait.switch_rule == "anywhere"
 
 
 def test_lists_are_written_as_in_toml():
     config, _ = parse("--command.times", "[0, 1]", "--command.velocities", "[-0.1, 0.2]")
     assert config.command.velocities == (-0.1, 0.2)
+    config, _ = parse("--gait.names", '["trot", "bound"]', "--gait.times=[0, 2.5]")
+    assert config.gait.names == ("trot", "bound")
+    assert config.gait.times == (0.0, 2.5)
 
 
 def test_an_unknown_option_is_one_line_with_the_nearest_name(capsys):
@@ -46,7 +52,8 @@ def test_help_shows_every_key_with_type_unit_and_default(capsys):
         parse("--help")
     text = " ".join(capsys.readouterr().out.split())
     assert "--lmpc.control_dt FLOAT Time between two plans [s]. default: 0.005" in text
-    assert "--gait.name {trot,stand}" in text
+    assert "--gait.switch_rule {flight,anywhere} When a bound may be left" in text
+    assert "--gait.names LIST" in text
 
 
 def test_an_unwritable_folder_is_one_line(capsys, tmp_path):

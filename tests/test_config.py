@@ -1,9 +1,13 @@
+from pathlib import Path
+
 import pytest
 
 from kjax.config import (
+    BoundConfig,
     ConfigError,
     DatasetConfig,
     FitStudyConfig,
+    GaitConfig,
     LmpcConfig,
     RunConfig,
     SrbConfig,
@@ -31,7 +35,44 @@ def message(overrides, cls=RunConfig, path=None):
         ({"lmpc.horizon": 2.5}, ("lmpc.horizon", "got 2.5", "integer")),
         ({"srb.mass": -1.0}, ("srb.mass", "got -1.0", "greater than 0")),
         ({"srb.mass": float("nan")}, ("srb.mass", "got nan", "finite")),
-        ({"gait.name": "trto"}, ("gait.name", "got 'trto'", "did you mean 'trot'")),
+        ({"gait.names": ["trto"]}, ("gait.names", "got 'trto'", "did you mean 'trot'")),
+        ({"gait.names": "trot"}, ("gait.names", "got 'trot'")),
+        ({"gait.name": "trot"}, ("gait.name", "unknown key", "did you mean 'gait.names'")),
+        ({"gait.names": ["trot", "bound"]}, ("gait", "equally long", "2", "1")),
+        ({"gait.times": [0.0, 1.0]}, ("gait", "equally long", "1", "2")),
+        ({"gait.names": [], "gait.times": []}, ("gait", "not empty", "0")),
+        ({"gait.times": [0.5]}, ("gait", "start at 0", "0.5")),
+        ({"gait.times": [-1.0]}, ("gait.times", "got -1.0", "greater than or equal to 0")),
+        (
+            {"gait.names": ["trot", "bound", "trot"], "gait.times": [0.0, 2.0, 2.0]},
+            ("gait", "increase", "[0.0, 2.0, 2.0]"),
+        ),
+        (
+            {"gait.names": ["trot", "bound", "trot"], "gait.times": [0.0, 2.0, 1.0]},
+            ("gait", "increase", "[0.0, 2.0, 1.0]"),
+        ),
+        ({"gait.switch_rule": "flght"}, ("gait.switch_rule", "did you mean 'flight'")),
+        ({"bound.reference": "none"}, ("bound.reference", "got 'none'")),
+        ({"bound.force_z_min": 400.0}, ("bound", "force_z_min", "400.0", "300.0")),
+        ({"bound.force_z_max": 10.0}, ("bound", "force_z_min", "20.0", "10.0")),
+        ({"bound.ramp_start": 0.0}, ("bound.ramp_start", "got 0.0", "greater than 0")),
+        ({"bound.ramp_start": 1.5}, ("bound.ramp_start", "got 1.5", "less than or equal to 1")),
+        ({"bound.ramp_cycles": -1}, ("bound.ramp_cycles", "got -1")),
+        ({"gait.stance_time": 0.004}, ("gait.stance_time", "0.004", "lmpc.control_dt", "0.005")),
+        ({"bound.front_stance": 0.004}, ("bound.front_stance", "0.004", "control_dt", "0.005")),
+        ({"bound.rear_stance": 0.004}, ("bound.rear_stance", "0.004", "control_dt", "0.005")),
+        ({"bound.first_flight": 0.01}, ("bound.first_flight", "ramp_start", "0.003", "0.005")),
+        ({"bound.second_flight": 0.01}, ("bound.second_flight", "ramp_start", "0.003", "0.005")),
+        ({"bound.ramp_start": 0.04}, ("flight", "ramp_start", "0.004", "lmpc.control_dt 0.005")),
+        ({"lmpc.control_dt": 0.06}, ("bound.rear_stance", "0.05", "lmpc.control_dt 0.06")),
+        pytest.param(
+            {"gait.trot_flight": 0.002},
+            ("gait.trot_flight", "0.002", "lmpc.control_dt", "0.005"),
+        ),
+        pytest.param(
+            {"gait.landing_time": 0.002},
+            ("gait.landing_time", "0.002", "lmpc.control_dt", "0.005"),
+        ),
         ({"lmpc.force_z_min": 200.0}, ("lmpc", "force_z_min", "200.0", "160.0")),
         ({"lmpc.model_dt": 0.0015}, ("lmpc.model_dt", "multiple", "0.0015")),
         ({"lmpc.control_dt": 0.0004}, ("lmpc.control_dt", "multiple", "0.0004")),
@@ -84,6 +125,34 @@ def test_building_a_config_in_python_checks_it_too():
         SrbConfig(mass=-3.0)
     with pytest.raises(ValueError, match="force_z"):
         DatasetConfig(force_z=(10.0, 0.0))
+    with pytest.raises(ValueError, match="force_z_min must not exceed force_z_max"):
+        BoundConfig(force_z_min=30.0, force_z_max=20.0)
+    with pytest.raises(ValueError, match="times must increase"):
+        GaitConfig(names=("trot", "bound", "trot"), times=(0.0, 1.0, 1.0))
+    with pytest.raises(ValueError, match="shorter than"):
+        RunConfig(bound=BoundConfig(first_flight=0.01))
+
+
+def test_phases_as_short_as_a_tick_are_allowed():
+    """A flight need only reach the tick at its shortest, where its ramp begins."""
+    shortest = {"bound.front_stance": 0.005, "bound.rear_stance": 0.005, "bound.ramp_start": 0.5}
+    shortest |= {"bound.first_flight": 0.01, "bound.second_flight": 0.01, "gait.trot_flight": 0.0}
+    config = load_config(RunConfig, None, shortest)
+    assert config.bound.first_flight * config.bound.ramp_start == config.lmpc.control_dt
+
+
+def test_gaits_follow_one_another_at_their_times():
+    config = load_config(
+        RunConfig, None, {"gait.names": ["trot", "bound", "stand"], "gait.times": [0, 1.5, 4]}
+    )
+    assert config.gait.names == ("trot", "bound", "stand")
+    assert config.gait.times == (0.0, 1.5, 4.0)
+
+
+def test_the_bound_s_force_limits_may_be_switched_off():
+    infinite = {"force_x_max": float("inf"), "force_z_max": float("inf")}
+    config = load_config(RunConfig, None, {f"bound.{key}": v for key, v in infinite.items()})
+    assert config.bound.force_x_max == config.bound.force_z_max == float("inf")
 
 
 @pytest.mark.parametrize("cls", [RunConfig, FitStudyConfig])
@@ -93,6 +162,12 @@ def test_every_key_has_a_description_that_ends_with_its_unit(cls):
         assert info.description.endswith("]."), (name, info.description)
 
 
-@pytest.mark.parametrize("path", ["trot_velocity.toml", "trot_velocity_long.toml"], ids=lambda p: p)
-def test_the_shipped_configs_load(path, repository):
-    assert load_config(RunConfig, repository / "configs" / path).duration == 22.0
+CONFIGS = sorted(path.name for path in (Path(__file__).parents[1] / "configs").glob("*.toml"))
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_shipped_configs_load(name, repository):
+    cls = FitStudyConfig if name == "koopman_fit.toml" else RunConfig
+    config = load_config(cls, repository / "configs" / name)
+    if name in ("trot_velocity.toml", "trot_velocity_long.toml"):
+        assert config.duration == 22.0

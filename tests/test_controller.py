@@ -1,5 +1,7 @@
 """The controller as a set of pure functions: rates, shapes, purity, faults."""
 
+import itertools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -7,8 +9,17 @@ import numpy as np
 import pytest
 
 from kjax import Observation, RunConfig, build_controller, build_params, load_config, qp
+from kjax.controller import build_gaits
 from kjax.robots import go1
 from kjax.types import Leg, Mode
+
+STANCE = {
+    Mode.TROT: [True, False, False, True],  # the first diagonal
+    Mode.FRONT: [True, True, False, False],
+    Mode.REAR: [False, False, True, True],
+    Mode.FLIGHT: [False] * 4,
+    Mode.STAND: [True] * 4,
+}
 
 
 def standing(dtype=float, **changes):
@@ -34,6 +45,20 @@ def controller():
 @pytest.fixture(scope="module")
 def params():
     return build_params(RunConfig(), go1.PARAMS)
+
+
+def bounding(**changes):
+    """A bound at the full length of its flights from the start.
+
+    Its parameters have the shapes of the default's, so that both share their compiled functions.
+    """
+    chosen = {"gait.names": ["bound"], "bound.ramp_start": 1.0}
+    return load_config(RunConfig, None, chosen | changes)
+
+
+@pytest.fixture(scope="module")
+def bound_params():
+    return build_params(bounding(), go1.PARAMS)
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +142,10 @@ def test_torques_stay_within_the_robots_limits(controller, params, plan, act):
     assert (np.abs(torque) == go1.PARAMS.torque_limit).any()
 
 
+@pytest.mark.parametrize("config", [RunConfig(), bounding()], ids=["trot", "bound"])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_state_keeps_its_tree_shapes_and_types(controller, dtype):
-    params = build_params(RunConfig(), go1.PARAMS, dtype=dtype)
+def test_state_keeps_its_tree_shapes_and_types(controller, dtype, config):
+    params = build_params(config, go1.PARAMS, dtype=dtype)
     observation = standing(dtype)
     state = jax.eval_shape(controller.init, params, observation)
     planned, _ = jax.eval_shape(controller.plan, params, state, observation)
@@ -150,13 +176,14 @@ def test_one_trace_serves_all_gaits_commands_and_phases(controller, params):
     for tick in range(120):  # more than a whole stride of 0.5 s
         state, info = counted(params, state, observation)
         assert int(info.status) == qp.Status.SOLVED, tick
-    other = params._replace(
-        gait=jnp.asarray(1, jnp.int32),
-        command=params.command._replace(velocities=params.command.velocities + 0.1),
-    )
-    state, info = counted(other, controller.init(other, observation), observation)
-    assert int(info.mode) == Mode.STAND
-    assert state.stance.all()
+    for gait, mode in enumerate((Mode.TROT, Mode.FRONT, Mode.STAND)):
+        other = params._replace(
+            gaits=jnp.asarray([gait], jnp.int32),
+            command=params.command._replace(velocities=params.command.velocities + 0.1),
+        )
+        state, info = counted(other, controller.init(other, observation), observation)
+        assert int(info.mode) == mode
+        np.testing.assert_array_equal(state.stance, STANCE[mode])
 
 
 def test_trot_swaps_diagonals_every_stance_time(controller, params, plan):
@@ -168,6 +195,260 @@ def test_trot_swaps_diagonals_every_stance_time(controller, params, plan):
         pattern.append(bool(state.stance[Leg.FR]))
     # 0.25 s at 200 Hz
     assert pattern == ([True] * 50 + [False] * 50) * 2
+
+
+def plans(controller, params, plan, ticks, observation=None):
+    """States and infos of ``ticks`` plans for a robot that stands still."""
+    observation = standing() if observation is None else observation
+    state, results = controller.init(params, observation), []
+    for _ in range(ticks):
+        state, info = plan(params, state, observation)
+        results.append((state, info))
+    return jax.device_get(jax.tree.map(lambda *leaves: np.stack(leaves), *results))
+
+
+@pytest.fixture(scope="module")
+def two_bounds(controller, bound_params, plan):
+    """0.7 s, two cycles."""
+    return plans(controller, bound_params, plan, 140)
+
+
+# 0.10, 0.10, 0.05 and 0.10 s at 200 Hz
+CYCLE = [Mode.FRONT] * 20 + [Mode.FLIGHT] * 20 + [Mode.REAR] * 10 + [Mode.FLIGHT] * 20
+
+
+def test_a_bound_is_front_stance_flight_rear_stance_flight(two_bounds):
+    states, infos = two_bounds
+    assert infos.mode.tolist() == CYCLE * 2
+    np.testing.assert_array_equal(states.stance, [STANCE[mode] for mode in CYCLE * 2])
+    np.testing.assert_array_equal(states.clock.cycle, np.repeat([0, 1], 70))
+    assert (infos.status == qp.Status.SOLVED).all()
+
+
+def test_no_leg_in_the_air_has_a_force_and_every_leg_on_the_ground_has_one(two_bounds):
+    states, _ = two_bounds
+    np.testing.assert_array_equal(states.force[~states.stance], 0.0)
+    assert (states.force[states.stance][:, 1] >= 20.0).all()
+
+
+def test_legs_swing_from_the_end_of_their_stance_to_its_next_beginning(two_bounds):
+    """What the swing takes is the rest of the cycle: 0.25 s in front, 0.30 s behind."""
+    states, _ = two_bounds
+    lifted = np.diff(states.stance.astype(int), axis=0) < 0
+    for leg in Leg:
+        at = np.flatnonzero(lifted[:, leg]) + 1
+        np.testing.assert_array_equal(at, [20, 90] if leg in (Leg.FR, Leg.FL) else [50, 120])
+        wait = 0.25 if leg in (Leg.FR, Leg.FL) else 0.30
+        # The first tick of the phase, within rounding of its clock.
+        np.testing.assert_allclose(states.swing.duration[at, leg], wait, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(states.swing.elapsed[at, leg], 0.0)
+
+
+def test_a_bound_ramps_up_by_its_flights(controller, plan):
+    params = build_params(bounding(**{"bound.ramp_start": 0.5}), go1.PARAMS)
+    states, infos = plans(controller, params, plan, 50 + 52 + 54)
+    # Half of 20 ticks of flight, and a tick more in each of 10 cycles.
+    expected = []
+    for flight in (10, 11, 12):
+        expected += [Mode.FRONT] * 20 + [Mode.FLIGHT] * flight
+        expected += [Mode.REAR] * 10 + [Mode.FLIGHT] * flight
+    assert infos.mode.tolist() == expected
+    # The reference of each cycle is the one of its own flights: higher every time.
+    assert (np.diff(np.ptp(np.asarray(params.reference)[1, ..., 0], axis=(1, 2))) > 0).all()
+    for cycle, begin in enumerate((0, 50, 102)):
+        assert states.clock.cycle[begin] == cycle
+        # At the cycle's first tick the reference is 1 ms into the first row: v_z falls by less
+        # than 10 m/s^2 times that, and differs by more than that between the cycles.
+        first = np.asarray(params.reference)[1, cycle, 0, 0, 2]
+        assert infos.reference[begin, 4] == pytest.approx(first, abs=0.0099)
+        assert abs(first - np.asarray(params.reference)[1, cycle + 1, 0, 0, 2]) > 0.0200
+
+
+# A robot that is high and flies up wants no force at all, one that is low and falls wants more
+# than there is; the horizontal force wanted is large as well.
+EAGER = {
+    "least": {"base_pos": [0.0, 0.0, 0.40], "base_vel": [-2.0, 0.0, 2.0]},
+    "most": {"base_pos": [0.0, 0.0, 0.15], "base_vel": [2.0, 0.0, -2.0]},
+}
+
+
+@pytest.mark.parametrize(
+    ("mode", "least", "most", "sideways"),
+    [
+        (Mode.TROT, 0.0, 160.0, 60.0),
+        (Mode.FRONT, 20.0, 300.0, 51.5),
+        (Mode.REAR, 20.0, 300.0, 51.5),
+        (Mode.STAND, 0.0, 160.0, 60.0),
+    ],
+)
+def test_each_mode_presses_within_its_own_limits_and_reaches_them(
+    controller, bound_params, plan, mode, least, most, sideways
+):
+    index = {Mode.TROT: 0, Mode.FRONT: 1, Mode.REAR: 1, Mode.STAND: 2}[mode]
+    params = bound_params._replace(gaits=jnp.asarray([index], jnp.int32))
+    for name, limit in (("least", least), ("most", most)):
+        observation = standing(**EAGER[name])
+        state = controller.init(params, observation)
+        if mode == Mode.REAR:  # the phase after the first flight
+            state = state._replace(clock=state.clock._replace(phase=jnp.asarray(2, jnp.int32)))
+        state, info = plan(params, state, observation)
+        assert int(info.mode) == mode
+        force, stance = np.asarray(state.force), np.asarray(state.stance)
+        np.testing.assert_array_equal(stance, STANCE[mode])
+        np.testing.assert_array_equal(force[~stance], 0.0)
+        np.testing.assert_array_equal(force[stance, 1], limit)
+        assert (np.abs(force[stance, 0]) <= sideways).all()
+        assert (np.abs(force[stance, 0]) == sideways).any()
+
+
+def test_a_bound_s_reference_is_the_body_s_own_motion_at_the_clock_s_place(
+    two_bounds, bound_params
+):
+    """Level in the mean: the body turns and rises, and the reference with it, tick by tick."""
+    _, infos = two_bounds
+    table = np.asarray(bound_params.reference)[1, 0]
+    now = 0.005 * np.arange(70)
+    rows = []
+    begins = np.cumsum([0.0, 0.10, 0.10, 0.05, 0.10])
+    for phase, (begin, end) in enumerate(itertools.pairwise(begins)):
+        inside = now[(now > begin - 1e-9) & (now < end - 1e-9)] - begin
+        at = np.linspace(0.0, end - begin, table.shape[1])
+        rows += [[np.interp(t + 0.001, at, column) for column in table[phase].T] for t in inside]
+    expected = np.tile(rows, (2, 1))
+    # One model step ahead; the clock's place in the phase is rounded, rates of up to 100/s^2.
+    np.testing.assert_allclose(infos.reference[:, 1], 0.27 + expected[:, 0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(infos.reference[:, 2], expected[:, 1], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(infos.reference[:, 4:], expected[:, 2:], rtol=0, atol=1e-10)
+    assert np.ptp(expected[:, 1]) > 0.05
+
+
+def test_only_a_bound_has_a_periodic_reference_and_only_if_it_is_asked_for(bound_params):
+    reference = np.asarray(bound_params.reference)
+    names = ("trot", "bound", "stand")
+    for name, rows in zip(names, reference, strict=True):
+        assert rows.any() == (name == "bound")
+    constant = build_params(bounding(**{"bound.reference": "constant"}), go1.PARAMS)
+    assert constant.reference.shape == reference.shape
+    np.testing.assert_array_equal(constant.reference, 0.0)
+
+
+def test_a_constant_reference_is_level_and_at_rest_in_every_phase(controller, plan):
+    params = build_params(bounding(**{"bound.reference": "constant"}), go1.PARAMS)
+    _, infos = plans(controller, params, plan, 70)
+    assert infos.mode.tolist() == CYCLE
+    level = np.tile([0.27, 0.0, 0.0, 0.0, 0.0], (70, 1))
+    np.testing.assert_array_equal(infos.reference[:, 1:], level)
+
+
+def test_gaits_are_switched_at_their_times_in_one_trace(controller):
+    """From bound to trot in the first flight, and to stand in the flight that comes next.
+
+    Bound from 0.1 s; trot is asked for at 0.23 s, 30 ms into the flight after front stance. Bound
+    again from 0.3 s; stand is asked for at 0.53 s, in rear stance: the flight after front stance
+    is that of the next cycle, from 0.3 + 0.35 + 0.1 s on.
+    """
+    chosen = {"gait.names": ["trot", "bound", "trot", "bound", "stand"]}
+    chosen |= {"gait.times": [0.0, 0.1, 0.23, 0.3, 0.53], "gait.stance_time": 0.22}
+    config = bounding(**chosen)
+    counted = jax.jit(chex.assert_max_traces(controller.plan, n=1))
+    states, infos = plans(controller, build_params(config, go1.PARAMS), counted, 170)
+    assert (infos.status == qp.Status.SOLVED).all()
+    gaits = [0] * 20 + [1] * 26 + [0] * 14 + [1] * 90 + [2] * 20
+    assert states.clock.gait.tolist() == gaits
+    modes = [Mode.TROT] * 20 + CYCLE[:26] + [Mode.TROT] * 14 + CYCLE + CYCLE[:20]
+    assert infos.mode.tolist() == modes + [Mode.STAND] * 20
+    # Legs in the air when a gait begins have its time to come down, whatever they had before: the
+    # rear ones of the bound front stance and flight, the others of the trot its stance.
+    rear, swinging = [Leg.RR, Leg.RL], [Leg.FL, Leg.RR]
+    np.testing.assert_allclose(states.swing.duration[20, rear], 0.20, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(states.stance[46], STANCE[Mode.TROT])
+    np.testing.assert_allclose(states.swing.duration[46, swinging], 0.22, rtol=0, atol=1e-12)
+
+
+def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait():
+    trot, bound, stand = build_gaits(bounding())
+    assert trot.leave_through == bound.leave_through == stand.leave_through == ""
+    config = bounding(**{"gait.landing_time": 0.06, "gait.trot_flight": 0.02})
+    *others, landing = gaits = build_gaits(config)
+    assert [g.leave_through for g in others] == ["", "landing", ""]
+    assert [(p.mode, p.stance, p.duration) for p in landing.phases] == [
+        (Mode.STAND, (True,) * 4, 0.06)
+    ]
+    assert landing.leave_when_done
+    assert not any(g.leave_when_done for g in others)
+    # One number for each gait, and the landing is at the trot's height.
+    params = build_params(config, go1.PARAMS)
+    assert len(gaits) == len(params.height) == len(params.swing.apex) == len(params.reference) == 4
+    np.testing.assert_array_equal(params.height[3], config.lmpc.height)
+    np.testing.assert_array_equal(params.schedule.leave_through, [0, 3, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("rule", "free"), [("flight", [False, True, False, False]), ("anywhere", [True] * 4)]
+)
+def test_the_rule_says_in_which_phases_a_bound_may_be_left(rule, free):
+    trot, bound, stand = build_gaits(bounding(**{"gait.switch_rule": rule}))
+    assert [phase.may_leave for phase in bound.phases] == free
+    assert all(phase.may_leave for phase in trot.phases + stand.phases)
+
+
+def test_footholds_of_a_bound_lie_closer_under_the_body(controller, bound_params, plan):
+    """Standing, the feet of a swing end as far from the trunk's middle as the config says."""
+    offset = np.asarray(bound_params.swing.offset)
+    hips = np.asarray(go1.PARAMS.hip_pos)[:, 0]
+    np.testing.assert_array_equal(offset[[0, 2]], 0.0)
+    # Rounding of a sum.
+    np.testing.assert_allclose(hips + offset[1], [0.075, 0.075, -0.148, -0.148], rtol=1e-15)
+    np.testing.assert_array_equal(bound_params.swing.apex, [0.06, 0.064, 0.06])
+    np.testing.assert_array_equal(bound_params.swing.velocity_gain, [0.03, 0.075, 0.03])
+
+
+def test_the_model_of_a_bound_stands_where_its_feet_do(bound_params):
+    """Two legs 0.075 m ahead or 0.148 m behind; the other modes stand at the rigid body's feet."""
+    B = 0.394 / 1e-3 * np.asarray(bound_params.tables.model.B)[:, 6]  # moment per force
+    ahead = {
+        Mode.FRONT: [2 * 0.075, 0.0],
+        Mode.REAR: [0.0, -2 * 0.148],
+        Mode.TROT: [0.190, -0.186],
+        Mode.STAND: [2 * 0.190, -2 * 0.186],
+    }
+    for mode, arms in ahead.items():
+        # The pitch rate is linear in the forces: the fit is exact but for rounding.
+        np.testing.assert_allclose(B[mode, 1::2], arms, rtol=0, atol=1e-10)
+    # Below the centre of mass lies, at 0.27 m, the sole, and a radius higher the foot's centre.
+    for mode, column in ((Mode.FRONT, 0), (Mode.REAR, 2)):
+        assert 0.27 - go1.FOOT_RADIUS - 1e-9 <= B[mode, column] / 2 <= 0.27 + 1e-9
+
+
+def test_a_bound_s_feet_swing_to_their_own_footholds(controller, bound_params, plan, act):
+    """The same tick of a swing, with the apex and the foothold of either gait, by hand."""
+    observation = standing()._replace(contact=jnp.zeros(4, bool))
+    state = controller.init(bound_params, observation)
+    for _ in range(20 + 1):  # the first flight
+        state, info = plan(bound_params, state, observation)
+    assert int(info.mode) == Mode.FLIGHT
+    # At the end of the swing each foot is to be on its foothold, at rest.
+    swing = state.swing._replace(elapsed=jnp.full(4, 0.25), duration=jnp.full(4, 0.25))
+    _, torque = act(bound_params, state._replace(swing=swing), observation)
+    feet = np.asarray(observation.base_pos)[0] + np.array([0.075, 0.075, -0.148, -0.148])
+    expected = []
+    for leg in Leg:
+        local = np.array([feet[leg], go1.FOOT_RADIUS]) - [0.0, float(observation.base_pos[2])]
+        angles = knee_backward(local - np.asarray(go1.PARAMS.hip_pos)[leg, ::2])
+        expected.append(150.0 * (angles - np.asarray(observation.joint_pos)[leg, 1:]))
+    limit = np.asarray(go1.PARAMS.torque_limit)[1:]
+    # Stiffness times the rounding of angles of order one.
+    np.testing.assert_allclose(torque[:, 1:], np.clip(expected, -limit, limit), atol=1e-9)
+    assert np.abs(expected).max() > 5.0
+
+
+def knee_backward(foot):
+    """Thigh and calf angle for a foot (x, z) from the hip, by the law of cosines."""
+    l1, l2 = go1.THIGH_LENGTH, go1.CALF_LENGTH
+    reach = foot @ foot
+    knee = -np.arccos((reach - l1**2 - l2**2) / (2 * l1 * l2))
+    lean = np.arctan2(-foot[0], -foot[1])
+    return np.array([lean - np.arctan2(l2 * np.sin(knee), l1 + l2 * np.cos(knee)), knee])
 
 
 def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller, params, plan):

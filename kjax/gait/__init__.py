@@ -1,5 +1,33 @@
-"""Gaits: schedules as data, and the phase clock."""
+"""Gaits: schedules as data, the phase clock, the switch between gaits, periodic references."""
 
-from kjax.gait.schedule import Clock, Phase, Schedule, advance, build_schedule, stand, start, trot
+from kjax.gait.schedule import (
+    Clock,
+    Gait,
+    Phase,
+    Schedule,
+    advance,
+    bound,
+    build_schedule,
+    flight_scale,
+    phase_duration,
+    stand,
+    start,
+    time_to_touchdown,
+    trot,
+)
 
-__all__ = ["Clock", "Phase", "Schedule", "advance", "build_schedule", "stand", "start", "trot"]
+__all__ = [
+    "Clock",
+    "Gait",
+    "Phase",
+    "Schedule",
+    "advance",
+    "bound",
+    "build_schedule",
+    "flight_scale",
+    "phase_duration",
+    "stand",
+    "start",
+    "time_to_touchdown",
+    "trot",
+]

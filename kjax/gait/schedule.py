@@ -5,8 +5,10 @@ Gaits are stacked on a leading axis and padded to one number of phases, so that 
 switching a gait is an index and never recompiles.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -15,24 +17,59 @@ from kjax.types import Mode
 
 
 class Phase(NamedTuple):
-    """One phase of a gait: stance flags in leg order (FR, FL, RR, RL), mode, duration [s]."""
+    """One phase of a gait.
+
+    Attributes:
+      stance: whether each leg stands, order FR, FL, RR, RL.
+      mode: contact mode.
+      duration: [s].
+      may_leave: whether a switch to another gait may happen during this phase.
+    """
 
     stance: tuple[bool, bool, bool, bool]
     mode: Mode
     duration: float
+    may_leave: bool = True
+
+
+class Gait(NamedTuple):
+    """A cycle of phases.
+
+    Attributes:
+      name: of the gait.
+      phases: in order.
+      ramp_start: flights begin at this fraction of their length and grow to all of it [-].
+      ramp_cycles: over so many cycles; 0 for no ramp.
+      leave_when_done: a switch waits for the end of the phase.
+      leave_through: name of the gait in between when this one is left; itself for none.
+    """
+
+    name: str
+    phases: tuple[Phase, ...]
+    ramp_start: float = 1.0
+    ramp_cycles: int = 0
+    leave_when_done: bool = False
+    leave_through: str = ""
 
 
 class Schedule(NamedTuple):
-    """Stacked gaits (G gaits, P phases, padding repeats phase 0 and is never entered).
+    """Stacked gaits (G gaits, P phases; padding is never entered).
 
     Attributes:
       phases: (G,) number of phases of the gait.
-      duration: (G, P) duration of the phase [s].
+      duration: (G, P) duration of the phase, flights at full length [s].
       mode: (G, P) contact mode.
       stance: (G, P, 4) whether the leg stands.
       time_to_touchdown: (G, P, 4) from the phase's start to the leg's next touchdown, 0 in
-        stance [s].
+        stance, flights at full length [s].
+      flight_to_touchdown: (G, P, 4, 2) parts of it that are flights of this and of the next cycle,
+        whose lengths differ while a ramp lasts [s].
       stance_time: (G, P, 4) length of the leg's current or next stance [s].
+      may_leave: (G, P) whether a switch to another gait may happen during the phase.
+      leave_when_done: (G,) whether it waits for the phase's end.
+      leave_through: (G,) gait in between, itself for none.
+      ramp_start: (G,) fraction of the flights' length in the first cycle [-].
+      ramp_cycles: (G,) cycles until it is 1.
     """
 
     phases: Int[Array, "G"]
@@ -40,7 +77,13 @@ class Schedule(NamedTuple):
     mode: Int[Array, "G P"]
     stance: Bool[Array, "G P 4"]
     time_to_touchdown: Float[Array, "G P 4"]
+    flight_to_touchdown: Float[Array, "G P 4 2"]
     stance_time: Float[Array, "G P 4"]
+    may_leave: Bool[Array, "G P"]
+    leave_when_done: Bool[Array, "G"]
+    leave_through: Int[Array, "G"]
+    ramp_start: Float[Array, "G"]
+    ramp_cycles: Int[Array, "G"]
 
 
 class Clock(NamedTuple):
@@ -49,61 +92,149 @@ class Clock(NamedTuple):
     Attributes:
       gait: index into the schedule.
       phase: index of the phase.
+      cycle: number of completed cycles of this gait.
       elapsed: time since the phase began [s].
     """
 
     gait: Int[Array, ""]
     phase: Int[Array, ""]
+    cycle: Int[Array, ""]
     elapsed: Float[Array, ""]
 
 
-def trot(stance_time: float) -> list[Phase]:
-    """Diagonal pairs FR-RL and FL-RR in turn, ``stance_time`` [s] each."""
-    return [
-        Phase((True, False, False, True), Mode.TROT, stance_time),
-        Phase((False, True, True, False), Mode.TROT, stance_time),
-    ]
+def trot(stance_time: float, flight_time: float = 0.0) -> Gait:
+    """Diagonal pairs FR-RL and FL-RR in turn, ``stance_time`` [s] each; a flying trot with flight.
+
+    Args:
+      stance_time: of each diagonal [s].
+      flight_time: after each stance [s].
+    """
+    first, second = (True, False, False, True), (False, True, True, False)
+    air = Phase((False,) * 4, Mode.FLIGHT, flight_time)
+    phases = [Phase(first, Mode.TROT, stance_time), air, Phase(second, Mode.TROT, stance_time), air]
+    return Gait("trot", tuple(phase for phase in phases if phase.duration > 0))
 
 
-def stand() -> list[Phase]:
-    """All four feet down."""
-    return [Phase((True, True, True, True), Mode.STAND, 1.0)]
+def stand(duration: float = 1.0, name: str = "stand") -> Gait:
+    """All four feet down; as a landing between two gaits it lasts ``duration`` [s]."""
+    phase = Phase((True,) * 4, Mode.STAND, duration)
+    return Gait(name, (phase,), leave_when_done=name != "stand")
 
 
-def build_schedule(gaits: list[list[Phase]]) -> Schedule:
-    """Stack gaits into one schedule; works out touchdown and stance times per leg."""
-    if not gaits or not all(gaits):
-        raise ValueError("gaits must be a non-empty list of non-empty lists of phases")
-    for phase in (p for gait in gaits for p in gait):
-        if not phase.duration > 0:
-            raise ValueError(f"phase durations must be positive, got {phase.duration} s")
-    padded = max(len(gait) for gait in gaits)
-    rows = [[_timing(gait, min(i, len(gait) - 1)) for i in range(padded)] for gait in gaits]
-    phases = [[gait[min(i, len(gait) - 1)] for i in range(padded)] for gait in gaits]
-    return Schedule(
-        phases=jnp.asarray([len(gait) for gait in gaits]),
-        duration=jnp.asarray([[p.duration for p in row] for row in phases], float),
-        mode=jnp.asarray([[int(p.mode) for p in row] for row in phases]),
-        stance=jnp.asarray([[p.stance for p in row] for row in phases]),
-        time_to_touchdown=jnp.asarray(np.array([[t[0] for t in row] for row in rows], float)),
-        stance_time=jnp.asarray(np.array([[t[1] for t in row] for row in rows], float)),
+def bound(
+    front_stance: float,
+    first_flight: float,
+    rear_stance: float,
+    second_flight: float,
+    *,
+    ramp_start: float,
+    ramp_cycles: int,
+    leave_anywhere: bool = False,
+    leave_through: str = "",
+) -> Gait:
+    """Front stance, flight, rear stance, flight.
+
+    Args:
+      front_stance: [s].
+      first_flight: after it [s].
+      rear_stance: [s].
+      second_flight: after it [s].
+      ramp_start: see ``Gait``.
+      ramp_cycles: see ``Gait``.
+      leave_anywhere: allow a switch in every phase; else in the first flight only (Raibert's
+        rule: no foot is kicked into the ground that carries no weight).
+      leave_through: see ``Gait``.
+    """
+    front, rear, none = (True, True, False, False), (False, False, True, True), (False,) * 4
+    return Gait(
+        "bound",
+        (
+            Phase(front, Mode.FRONT, front_stance, leave_anywhere),
+            Phase(none, Mode.FLIGHT, first_flight, True),
+            Phase(rear, Mode.REAR, rear_stance, leave_anywhere),
+            Phase(none, Mode.FLIGHT, second_flight, leave_anywhere),
+        ),
+        ramp_start=ramp_start,
+        ramp_cycles=ramp_cycles,
+        leave_through=leave_through,
     )
 
 
-def _timing(gait: list[Phase], index: int) -> tuple[list[float], list[float]]:
-    """Time to touchdown and length of the current or next stance of each leg, at a phase start."""
-    wait, stance = [], []
+def build_schedule(gaits: list[Gait]) -> Schedule:
+    """Stack gaits into one schedule; works out touchdown and stance times per leg."""
+    if not gaits or not all(gait.phases for gait in gaits):
+        raise ValueError("gaits must be a non-empty list of gaits with at least one phase each")
+    names = [gait.name for gait in gaits]
+    for gait in gaits:
+        for phase in gait.phases:
+            if not phase.duration > 0:
+                raise ValueError(f"phase durations must be positive, got {phase.duration} s")
+        if (gait.leave_through or gait.name) not in names:
+            raise ValueError(f"leave_through names no gait here: {gait.leave_through!r}")
+    padded = max(len(gait.phases) for gait in gaits)
+    rows = [[(g.phases, min(i, len(g.phases) - 1)) for i in range(padded)] for g in gaits]
+
+    def table(value: Callable[[tuple[Phase, ...], int], Any], kind: type = float) -> Array:
+        return jnp.asarray(np.array([[value(*entry) for entry in row] for row in rows], kind))
+
+    return Schedule(
+        phases=jnp.asarray([len(gait.phases) for gait in gaits]),
+        duration=table(lambda phases, i: phases[i].duration),
+        mode=table(lambda phases, i: phases[i].mode, int),
+        stance=table(lambda phases, i: phases[i].stance, bool),
+        time_to_touchdown=table(_waits),
+        flight_to_touchdown=table(_flights),
+        stance_time=table(_stance_times),
+        may_leave=table(lambda phases, i: phases[i].may_leave, bool),
+        leave_when_done=jnp.asarray([gait.leave_when_done for gait in gaits]),
+        leave_through=jnp.asarray([names.index(g.leave_through or g.name) for g in gaits]),
+        ramp_start=jnp.asarray([gait.ramp_start for gait in gaits], float),
+        ramp_cycles=jnp.asarray([gait.ramp_cycles for gait in gaits]),
+    )
+
+
+def _steps_to_stance(phases: tuple[Phase, ...], index: int, leg: int) -> int:
+    """Number of phases from ``index`` on until the leg stands."""
+    n = len(phases)
+    for k in range(n):
+        if phases[(index + k) % n].stance[leg]:
+            return k
+    raise ValueError(f"leg {leg} never stands in this gait")
+
+
+def _waits(phases: tuple[Phase, ...], index: int) -> list[float]:
+    """Time to each leg's touchdown from the start of a phase, flights at full length."""
+    between = (_phases_to_stance(phases, index, leg) for leg in range(4))
+    return [sum((phases[k % len(phases)].duration for k in ahead), 0.0) for ahead in between]
+
+
+def _flights(phases: tuple[Phase, ...], index: int) -> list[list[float]]:
+    """Flight in each leg's time to touchdown: what lies in this cycle and in the next one."""
+    parts = []
     for leg in range(4):
-        ahead = [gait[(index + k) % len(gait)] for k in range(len(gait))]
-        first = next((k for k, phase in enumerate(ahead) if phase.stance[leg]), None)
-        if first is None:
-            raise ValueError(f"leg {leg} never stands in this gait")
-        wait.append(sum((phase.duration for phase in ahead[:first]), 0.0))
-        stance.append(_stance_length(gait, leg, index + first))
-    return wait, stance
+        sums = [0.0, 0.0]
+        for k in _phases_to_stance(phases, index, leg):
+            phase = phases[k % len(phases)]
+            if phase.mode == Mode.FLIGHT:
+                sums[k // len(phases)] += phase.duration
+        parts.append(sums)
+    return parts
 
 
-def _stance_length(gait: list[Phase], leg: int, index: int) -> float:
+def _phases_to_stance(phases: tuple[Phase, ...], index: int, leg: int) -> range:
+    """Phases from ``index`` on until the leg stands; indices run past the end of the cycle."""
+    return range(index, index + _steps_to_stance(phases, index, leg))
+
+
+def _stance_times(phases: tuple[Phase, ...], index: int) -> list[float]:
+    """Length of each leg's current or next stance, seen from a phase."""
+    return [
+        _stance_length(phases, leg, index + _steps_to_stance(phases, index, leg))
+        for leg in range(4)
+    ]
+
+
+def _stance_length(gait: tuple[Phase, ...], leg: int, index: int) -> float:
     """Length of the unbroken stance of ``leg`` that contains phase ``index`` of the cycle."""
     n = len(gait)
     if all(phase.stance[leg] for phase in gait):
@@ -118,28 +249,69 @@ def _stance_length(gait: list[Phase], leg: int, index: int) -> float:
     return length
 
 
-def start(gait: int | Array, control_dt: float) -> Clock:
-    """Clock whose first ``advance`` by ``control_dt`` enters phase 0 of a gait."""
-    return Clock(
-        gait=jnp.asarray(gait, jnp.int32),
-        phase=jnp.zeros((), jnp.int32),
-        elapsed=jnp.asarray(-control_dt, float),
-    )
+def start(gait: Int[Array, ""], elapsed: Float[Array, ""]) -> Clock:
+    """Clock at the beginning of a gait; ``elapsed`` < 0 [s] is the time until then."""
+    zero = jnp.zeros_like(gait)
+    return Clock(gait=gait, phase=zero, cycle=zero, elapsed=elapsed)
 
 
-def advance(schedule: Schedule, clock: Clock, dt: float) -> Clock:
-    """Clock after ``dt`` [s]; moves on by at most one phase.
+def flight_scale(schedule: Schedule, clock: Clock) -> Float[Array, ""]:
+    """Fraction of their full length that the flights have in this cycle [-]."""
+    begin, cycles = schedule.ramp_start[clock.gait], schedule.ramp_cycles[clock.gait]
+    grown = jnp.where(cycles > 0, jnp.minimum(clock.cycle / jnp.maximum(cycles, 1), 1.0), 1.0)
+    return begin + (1.0 - begin) * grown.astype(begin.dtype)
+
+
+def phase_duration(schedule: Schedule, clock: Clock) -> Float[Array, ""]:
+    """Length of the phase that the clock is in [s]."""
+    where = (clock.gait, clock.phase)
+    scale = jnp.where(schedule.mode[where] == Mode.FLIGHT, flight_scale(schedule, clock), 1.0)
+    return schedule.duration[where] * scale
+
+
+def time_to_touchdown(schedule: Schedule, clock: Clock) -> Float[Array, "4"]:
+    """Time from now to each leg's next touchdown, 0 in stance [s]."""
+    where = (clock.gait, clock.phase)
+    following = clock._replace(cycle=clock.cycle + 1)
+    scale = jnp.stack([flight_scale(schedule, clock), flight_scale(schedule, following)])
+    missing = schedule.flight_to_touchdown[where] @ (1.0 - scale)
+    wait = schedule.time_to_touchdown[where] - missing
+    return jnp.where(schedule.stance[where], 0.0, wait - clock.elapsed)
+
+
+def advance(
+    schedule: Schedule, clock: Clock, dt: float, wanted: Int[Array, ""] | None = None
+) -> Clock:
+    """Clock after ``dt`` [s]; moves on by at most one phase or into another gait.
 
     A phase ends at the tick nearest to its end, and the remainder is carried over, so that phases
     need not be multiples of the tick and the mean period stays exact.
+
+    Args:
+      schedule: of all gaits.
+      clock: now.
+      dt: tick [s].
+      wanted: gait to be in; it is entered as soon as the present gait's rule lets it.
     """
-    duration = schedule.duration[clock.gait, clock.phase]
+    duration = phase_duration(schedule, clock)
     elapsed = clock.elapsed + dt
     done = elapsed >= duration - 0.5 * dt
     following = clock.phase + 1
-    following = jnp.where(following >= schedule.phases[clock.gait], 0, following)
-    return Clock(
+    wraps = following >= schedule.phases[clock.gait]
+    following = jnp.where(wraps, 0, following)
+    onward = Clock(
         gait=clock.gait,
-        phase=jnp.where(done, following, clock.phase).astype(clock.phase.dtype),
+        phase=jnp.where(done, following, clock.phase),
+        cycle=jnp.where(done & wraps, clock.cycle + 1, clock.cycle),
         elapsed=jnp.where(done, elapsed - duration, elapsed),
     )
+    if wanted is None:
+        return onward
+    free = schedule.may_leave[onward.gait, onward.phase]
+    free = free & (done | ~schedule.leave_when_done[clock.gait])
+    through = schedule.leave_through[clock.gait]
+    target = jnp.where(through == clock.gait, wanted, through).astype(clock.gait.dtype)
+    entered = start(target, jnp.zeros_like(elapsed))
+    # A carried remainder is at least -dt / 2; anything below means that the gait has not begun.
+    leaves = free & (wanted != clock.gait) & (clock.elapsed > -0.75 * dt)
+    return jax.tree.map(lambda new, old: jnp.where(leaves, new, old), entered, onward)

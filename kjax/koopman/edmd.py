@@ -7,10 +7,12 @@ solved by QR followed by an SVD of the small triangular factor, which also revea
 regression is on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small steps.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from kjax import srb
@@ -18,7 +20,9 @@ from kjax.config import KoopmanConfig, SrbConfig
 from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
 from kjax.koopman.models import LinearModel
 from kjax.koopman.observables import Dictionary, paper
-from kjax.types import MODE_ALPHA
+from kjax.types import MODE_ALPHA, Mode
+
+Point = tuple[float, float]  # (x, z) [m]
 
 
 class FitReport(NamedTuple):
@@ -114,12 +118,22 @@ def build_dictionary(config: KoopmanConfig) -> Dictionary:
     )
 
 
-def srb_params(config: SrbConfig) -> srb.SrbParams:
-    """Body parameters as arrays of the current default precision."""
+def srb_params(
+    config: SrbConfig, mode_feet: Mapping[Mode, tuple[Point, Point]] | None = None
+) -> srb.SrbParams:
+    """Body parameters of every contact mode, stacked on a leading axis.
+
+    Args:
+      config: mass, inertia and the contact points of the modes that ``mode_feet`` leaves out.
+      mode_feet: (front, rear) contact points (x, z) of single modes, body frame [m].
+    """
+    feet = np.tile(np.array([config.feet_front, config.feet_rear], float), (len(Mode), 1, 1))
+    for mode, points in (mode_feet or {}).items():
+        feet[mode] = points
     return srb.SrbParams(
-        mass=jnp.asarray(config.mass, float),
-        inertia=jnp.asarray(config.inertia, float),
-        feet=jnp.asarray([config.feet_front, config.feet_rear], float),
+        mass=jnp.full(len(Mode), config.mass, float),
+        inertia=jnp.full(len(Mode), config.inertia, float),
+        feet=jnp.asarray(feet, float),
     )
 
 
@@ -133,7 +147,7 @@ def fit_modes(
     """One model per contact mode from random rollouts, all modes in one vmapped call.
 
     Args:
-      body: parameters of the rigid body.
+      body: parameters of the rigid body in every mode, stacked (``srb_params``).
       config: dictionary, dataset and kind of contact points.
       key: random key, usually of ``config.dataset.seed``; an argument, since XLA would evaluate
         the whole data set of a constant one while it compiles.
@@ -147,7 +161,7 @@ def fit_modes(
     vary_feet = config.feet == "measured"
     limits = ranges_from_config(data, vary_feet=vary_feet) if ranges is None else ranges
 
-    def one(key: Array, alpha: Array) -> tuple[LinearModel, FitReport]:
+    def one(key: Array, alpha: Array, body: srb.SrbParams) -> tuple[LinearModel, FitReport]:
         snapshots = sample(
             key,
             body,
@@ -161,4 +175,4 @@ def fit_modes(
         return fit(dictionary, snapshots, feet_terms=vary_feet)
 
     keys = jax.random.split(key, len(MODE_ALPHA))
-    return jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA, float))
+    return jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA, float), body)

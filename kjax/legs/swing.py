@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from kjax.legs.kinematics import PlanarState, foot_jacobian, inverse
 from kjax.types import RobotParams
@@ -15,20 +15,32 @@ class SwingParams(NamedTuple):
     """Swing settings; data, so they may differ between the robots of a batch.
 
     Attributes:
-      apex: height above the higher of lift-off and target [m].
+      apex: height above the higher of lift-off and target; (G,) by gait in the controller's
+        parameters, one number where it is used [m].
+      velocity_gain: foothold gain on the velocity error, likewise by gait [s].
+      offset: (4,) foothold ahead of the hip when standing still, likewise by gait [m].
       horizontal_fraction: part of the swing after which the foot is above its foothold [-].
-      velocity_gain: foothold gain on the velocity error [s].
       hold_after: part of the swing after which a contact means an obstacle [-].
       kp: joint stiffness of (abduction, thigh, calf) [N m/rad].
       kd: joint damping of the same [N m s/rad].
     """
 
-    apex: Float[Array, ""]
+    apex: Float[Array, "*gait"]
+    velocity_gain: Float[Array, "*gait"]
+    offset: Float[Array, "*gait 4"]
     horizontal_fraction: Float[Array, ""]
-    velocity_gain: Float[Array, ""]
     hold_after: Float[Array, ""]
     kp: Float[Array, "3"]
     kd: Float[Array, "3"]
+
+
+def for_gait(params: SwingParams, gait: Int[Array, ""]) -> SwingParams:
+    """Settings with those that depend on the gait picked for ``gait``."""
+    return params._replace(
+        apex=params.apex[gait],
+        velocity_gain=params.velocity_gain[gait],
+        offset=params.offset[gait],
+    )
 
 
 class SwingState(NamedTuple):
@@ -114,7 +126,12 @@ def foothold(
     """
     v = body.x[3]
     hips = body.base[0] + robot.hip_pos[:, ::2] @ body.rotation[0]
-    return hips + v * (remaining + 0.5 * stance_time) + params.velocity_gain * (v - velocity)
+    return (
+        hips
+        + params.offset
+        + v * (remaining + 0.5 * stance_time)
+        + params.velocity_gain * (v - velocity)
+    )
 
 
 def foot_reference(

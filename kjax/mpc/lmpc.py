@@ -3,6 +3,7 @@
 On line a plan is: lift, one matrix-vector product for the linear term, one box QP.
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -11,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax import qp
-from kjax.config import LmpcConfig
+from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman.models import LinearModel, aggregate, input_map
 from kjax.mpc.condense import condense
 from kjax.srb import GRAVITY
-from kjax.types import MODE_ALPHA
+from kjax.types import MODE_ALPHA, Mode
 
 
 class LmpcTables(NamedTuple):
@@ -44,77 +45,106 @@ class LmpcTables(NamedTuple):
     input_weights: Float[Array, "M 4"]
 
 
+class ModeSettings(NamedTuple):
+    """Weights and bounds of every contact mode (M modes).
+
+    Attributes:
+      state_weights: (M, 6) diagonal of Q.
+      input_weights: (M, 4) diagonal of R [1/N^2].
+      lower: (M, 4) lower force bounds, body frame [N].
+      upper: (M, 4) upper force bounds [N].
+      input_reference: (M, 4) forces that R penalises the distance from [N].
+    """
+
+    state_weights: np.ndarray
+    input_weights: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    input_reference: np.ndarray
+
+
+def mode_settings(lmpc: LmpcConfig, bound: BoundConfig, mass: float) -> ModeSettings:
+    """Settings per mode: the bound's own in front and rear stance, the LMPC's elsewhere."""
+    single = np.isin(np.arange(len(Mode)), [Mode.FRONT, Mode.REAR])[:, None]
+    standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
+
+    def chosen(of: Callable[[LmpcConfig | BoundConfig], Sequence[float]]) -> np.ndarray:
+        return np.where(single, np.asarray(of(bound)), np.asarray(of(lmpc)))
+
+    hover = np.outer(mass * GRAVITY / np.maximum(MODE_ALPHA.sum(axis=1), 1), [0.0, 1.0, 0.0, 1.0])
+    if lmpc.input_reference == "zero":
+        hover = np.zeros_like(hover)
+    lower = chosen(lambda config: [-config.force_x_max, config.force_z_min] * 2)
+    upper = chosen(lambda config: [config.force_x_max, config.force_z_max] * 2)
+    return ModeSettings(
+        state_weights=chosen(lambda config: config.state_weights),
+        input_weights=chosen(lambda config: [config.input_weight] * 4),
+        lower=np.where(standing, lower, 0.0),
+        upper=np.where(standing, upper, 0.0),
+        input_reference=np.where(standing, hover, 0.0),
+    )
+
+
 def build_tables(
-    model: LinearModel, config: LmpcConfig, *, data_dt: float, mass: float, feet: Array
+    model: LinearModel,
+    settings: ModeSettings,
+    *,
+    steps: int,
+    horizon: int,
+    feet: Float[Array, "M 2 2"],
 ) -> LmpcTables:
     """Tables of all contact modes; call it in float64.
 
     Args:
-      model: one-step models of all modes, step ``data_dt``.
-      config: weights, bounds, horizon.
-      data_dt: step of the fitted models [s].
-      mass: body mass, for the hover force [kg].
-      feet: (2, 2) nominal contact points [m].
+      model: one-step models of all modes.
+      settings: weights and bounds of all modes.
+      steps: number of model steps that one step of the prediction holds.
+      horizon: number k of prediction steps.
+      feet: (M, 2, 2) nominal contact points [m].
     """
-    steps = round(config.model_dt / data_dt)
-    k = config.horizon
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
-    modes = len(MODE_ALPHA)
-    Q = jnp.tile(jnp.asarray(config.state_weights), (modes, 1))
-    R = jnp.full((modes, 4), config.input_weight)
-    lower, upper, u_ref = force_bounds(config, mass)
+    Q, R, lower, upper, u_ref = (jnp.asarray(value) for value in settings)
 
-    def one(model: LinearModel, Q: Array, R: Array) -> tuple[qp.Prepared, Array, Array]:
-        problem = condense(model.A, input_map(model, feet), Q, R, k)
+    def one(
+        model: LinearModel, Q: Array, R: Array, feet: Array
+    ) -> tuple[qp.Prepared, Array, Array]:
+        problem = condense(model.A, input_map(model, feet), Q, R, horizon)
         return qp.prepare(problem.H), problem.F, problem.G
 
-    hessian, F, G = jax.vmap(one)(model, Q, R)
+    hessian, F, G = jax.vmap(one)(model, Q, R, feet)
     return LmpcTables(
         hessian=hessian,
         F=F,
         G=G,
-        q_input=jnp.tile(-2.0 * R * u_ref, (1, k)),
-        lower=jnp.tile(lower, (1, k)),
-        upper=jnp.tile(upper, (1, k)),
+        q_input=jnp.tile(-2.0 * R * u_ref, (1, horizon)),
+        lower=jnp.tile(lower, (1, horizon)),
+        upper=jnp.tile(upper, (1, horizon)),
         model=model,
         state_weights=Q,
         input_weights=R,
     )
 
 
-def force_bounds(config: LmpcConfig, mass: float) -> tuple[Float[Array, "M 4"], ...]:
-    """Lower bound, upper bound and reference of the four forces in every mode [N]."""
-    standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
-    lower = np.tile([-config.force_x_max, config.force_z_min], 2)
-    upper = np.tile([config.force_x_max, config.force_z_max], 2)
-    legs = np.maximum(MODE_ALPHA.sum(axis=1), 1)
-    hover = np.outer(mass * GRAVITY / legs, [0.0, 1.0, 0.0, 1.0])
-    reference = hover if config.input_reference == "hover" else np.zeros_like(hover)
-    return tuple(jnp.asarray(np.where(standing, a, 0.0)) for a in (lower, upper, reference))
-
-
 def reference_trajectory(
     *,
     position: Float[Array, ""],
-    height: Float[Array, ""],
     velocity: Float[Array, ""],
-    model_dt: float,
-    horizon: int,
+    height: Float[Array, ""],
+    periodic: Float[Array, "k 4"],
+    ahead: Float[Array, "k"],
 ) -> Float[Array, "k 6"]:
-    """Reference (k, 6) of steps 1..k: level trunk at constant height and forward velocity.
+    """Reference (k, 6): constant velocity, and the gait's periodic motion about a height.
 
     Args:
       position: reference of p_x now [m].
-      height: of the centre of mass [m].
       velocity: commanded v_x [m/s].
-      model_dt: step of the prediction [s].
-      horizon: number k of steps.
+      height: mean of the centre of mass [m].
+      periodic: (k, 4) deviation of p_z, theta, v_z, omega; zeros for a level trunk.
+      ahead: (k,) time of each step from now [s].
     """
-    ahead = model_dt * jnp.arange(1, horizon + 1, dtype=position.dtype)
-    zero = jnp.zeros_like(ahead)
-    return jnp.stack(
-        [position + velocity * ahead, zero + height, zero, zero + velocity, zero, zero], axis=-1
-    )
+    z, theta, v_z, omega = periodic.T
+    forward = jnp.full_like(ahead, velocity)
+    return jnp.stack([position + velocity * ahead, height + z, theta, forward, v_z, omega], -1)
 
 
 def solve_lmpc(

@@ -31,6 +31,7 @@ class Trajectory:
       feet: (N, 4, 2) foot centres (x, z), world [m].
       foot_force: (N, 4) normal force on the contact sensors [N].
       torque: (N, 4, 3) joint torques commanded (abduction, thigh, calf) [N m].
+      gait: (N,) index of the gait, order of ``controller.build_gaits``.
       stance: (N, 4) scheduled stance.
       force: (N, 4, 2) planned force on each leg, body frame [N].
       velocity_command: (N,) [m/s].
@@ -51,6 +52,7 @@ class Trajectory:
     feet: np.ndarray
     foot_force: np.ndarray
     torque: np.ndarray
+    gait: np.ndarray
     stance: np.ndarray
     force: np.ndarray
     velocity_command: np.ndarray
@@ -79,7 +81,8 @@ class Trajectory:
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
     """Qpos and qvel of the planar robot, standing, disturbed as the config and its seed say."""
-    height, joints = go1.stand_pose(config.lmpc.height)
+    bounding = config.gait.names[0] == "bound"
+    height, joints = go1.stand_pose(config.bound.height if bounding else config.lmpc.height)
     qpos, qvel = np.zeros(nq), np.zeros(nv)
     qpos[1], qpos[3:] = height, joints.reshape(-1)
     spread, noise = config.noise, np.random.default_rng([config.seed, 0])
@@ -147,6 +150,8 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         "height_min_m": float(height.min()),
         "height_max_m": float(height.max()),
         "distance_m": float(run.x[-1, 0] - run.x[0, 0]),
+        **_crossing(run, config),
+        **_switching(run, config),
         "foot_slip_m": foot_slip(run, config.sim.sim_dt, config.sim.contact_threshold),
         "torque_max_nm": float(np.abs(run.torque).max()),
         "torque_saturation_fraction": float(saturated.any(axis=(1, 2)).mean()),
@@ -159,6 +164,40 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         "realtime_factor": float(len(run.time) * config.sim.sim_dt / run.wall_time),
     }
     return result
+
+
+def _crossing(run: Trajectory, config: RunConfig) -> dict[str, Any]:
+    """Whether the robot has left the obstacle field behind, where there is one."""
+    if config.terrain.kind == "flat":
+        return {}
+    clear = config.terrain.end + 0.3  # m, the rear feet as well
+    inside = (run.x[:, 0] > config.terrain.start - 0.3) & (run.x[:, 0] < clear)
+    pitch = np.degrees(np.abs(run.x[inside, 2]))
+    return {
+        "crossed": bool(not run.fell and run.x[-1, 0] > clear),
+        "field_pitch_p95_deg": float(np.percentile(pitch, 95)) if inside.any() else None,
+    }
+
+
+def _switching(run: Trajectory, config: RunConfig) -> dict[str, Any]:
+    """When the last switch of gait happened, and the pitch after it.
+
+    Settled means: from then on the pitch stays within 3 deg, or within 1.1 times its largest value
+    in the last second where the gait itself pitches more.
+    """
+    changes = np.flatnonzero(np.diff(run.gait)) + 1
+    if len(config.gait.times) < 2 or not len(changes):
+        return {}
+    at = changes[np.searchsorted(run.time[changes], config.gait.times[-1] - 1e-9)]
+    pitch = np.degrees(np.abs(run.x[at:, 2]))
+    last = pitch[-round(1.0 / config.sim.sim_dt) :]
+    outside = np.flatnonzero(pitch > max(3.0, 1.1 * float(last.max())))
+    settled = (outside[-1] + 1) * config.sim.sim_dt if len(outside) else 0.0
+    return {
+        "switch_time_s": float(run.time[at]),
+        "switch_pitch_max_deg": float(pitch.max()),
+        "pitch_settle_s": float(settled),
+    }
 
 
 def foot_slip(run: Trajectory, dt: float, threshold: float) -> float:

@@ -58,7 +58,7 @@ def build_model(config: RunConfig) -> mujoco.MjModel:
             "MJX needs sim.contacts = 'feet' and sim.cone = 'pyramidal', got "
             f"'{config.sim.contacts}' and '{config.sim.cone}'"
         )
-    spec = build_spec(config.sim)
+    spec = build_spec(config.sim, config.terrain)
     spec.option.iterations = 6
     spec.option.ls_iterations = 8
     return spec.compile()

@@ -1,5 +1,6 @@
 """One robot in C MuJoCo: the physics steps in C, the controller in two jitted calls."""
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from kjax.controller import (
     build_params,
 )
 from kjax.robots import go1
+from kjax.sim import terrain
 from kjax.sim.episode import Trajectory, fallen, initial_state, sagittal, sensor_noise
 from kjax.sim.observe import NOISE_DIM, Addresses, Observe, add_noise, build_observe, resolve
 from kjax.sim.scene import build_model
@@ -33,6 +35,7 @@ OnTick = Callable[[int, int, mujoco.MjData], None]
 class TickLog(NamedTuple):
     """What is recorded at the MPC rate."""
 
+    gait: Any
     stance: Any
     force: Any
     velocity_command: Any
@@ -81,7 +84,7 @@ def build_simulation(config: RunConfig) -> Simulation:
     """
     if config.sim.base != "planar":
         raise ConfigError(f"sim.base: got '{config.sim.base}', the controller walks 'planar' only")
-    model = build_model(config.sim)
+    model = build_model(config.sim, config.terrain)
     observe = build_observe(model, config.sim.contact_threshold)
     controller, params = build_controller(config), build_params(config, go1.PARAMS)
     cuts = np.cumsum([model.nq, model.nv, model.nsensordata])
@@ -107,6 +110,7 @@ def build_simulation(config: RunConfig) -> Simulation:
     def plan_log(state: ControllerState, sensed: Array) -> tuple[ControllerState, TickLog]:
         state, info = controller.plan(params, state, sense(sensed))
         log = TickLog(
+            gait=state.clock.gait,
             stance=state.stance,
             force=state.force,
             velocity_command=state.velocity_command,
@@ -127,7 +131,7 @@ def build_simulation(config: RunConfig) -> Simulation:
         state, torque = controller.act(params, unpack(flat, state_like), sense(sensed))
         return pack(state), torque.reshape(-1)
 
-    dtype = params.height.dtype
+    dtype = params.position_slack.dtype
     example = jax.ShapeDtypeStruct((cuts[-1] + NOISE_DIM,), dtype)
     state_like = jax.eval_shape(lambda sensed: controller.init(params, sense(sensed)), example)
     _, log_like = jax.eval_shape(plan_log, state_like, example)
@@ -151,19 +155,28 @@ def build_simulation(config: RunConfig) -> Simulation:
 
 
 def simulate(
-    simulation: Simulation, *, seed: int | None = None, on_tick: OnTick | None = None
+    simulation: Simulation,
+    *,
+    seed: int | None = None,
+    terrain_seed: int | None = None,
+    on_tick: OnTick | None = None,
 ) -> Trajectory:
     """One episode. It ends at the config's duration, at a fall, or at Ctrl-C (and then returns).
 
     Args:
       simulation: from ``build_simulation``.
-      seed: in place of the config's.
+      seed: of noise and initial state, in place of the config's.
+      terrain_seed: of the obstacles, in place of the config's; moves those of the model.
       on_tick: called once per control tick.
     """
     config = simulation.config
     if seed is not None:
-        config = type(config)(**{**vars(config), "seed": seed})
+        config = dataclasses.replace(config, seed=seed)
     model, at = simulation.model, simulation.addresses
+    field = config.terrain
+    if terrain_seed is not None:
+        field = dataclasses.replace(field, seed=terrain_seed)
+    terrain.place(model, terrain.generate(field, config.sim.friction))
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
     mujoco.mj_forward(model, data)
@@ -234,6 +247,7 @@ def simulate(
         feet=feet,
         foot_force=foot_force[keep],
         torque=torque[keep].reshape(-1, 4, 3),
+        gait=ticks_log.gait[held],
         stance=ticks_log.stance[held],
         force=ticks_log.force[held],
         velocity_command=ticks_log.velocity_command[held],

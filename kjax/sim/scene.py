@@ -3,8 +3,9 @@
 import mujoco
 import numpy as np
 
-from kjax.config import SimConfig
+from kjax.config import SimConfig, TerrainConfig
 from kjax.robots import go1
+from kjax.sim.terrain import add_obstacles
 
 _CONES = {
     "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
@@ -12,8 +13,8 @@ _CONES = {
 }
 
 
-def build_spec(config: SimConfig) -> mujoco.MjSpec:
-    """MjSpec of the Go1 on flat ground, open to further edits before ``compile``."""
+def build_spec(config: SimConfig, terrain: TerrainConfig | None = None) -> mujoco.MjSpec:
+    """MjSpec of the Go1 on its ground, open to further edits before ``compile``."""
     spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
     spec.option.timestep = config.sim_dt
     spec.option.cone = _CONES[config.cone]
@@ -30,12 +31,14 @@ def build_spec(config: SimConfig) -> mujoco.MjSpec:
             geom.contype, geom.conaffinity = 0, 0
     _add_base(spec, config.base)
     _add_world(spec)
+    if terrain is not None:
+        add_obstacles(spec, terrain, config.friction)
     return spec
 
 
-def build_model(config: SimConfig) -> mujoco.MjModel:
-    """Compiled model of the Go1 on flat ground."""
-    return build_spec(config).compile()
+def build_model(config: SimConfig, terrain: TerrainConfig | None = None) -> mujoco.MjModel:
+    """Compiled model of the Go1 on its ground, flat by default."""
+    return build_spec(config, terrain).compile()
 
 
 def _add_base(spec: mujoco.MjSpec, base: str) -> None:

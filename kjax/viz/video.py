@@ -58,7 +58,7 @@ def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
 
     from kjax.sim.scene import build_model
 
-    model = build_model(config.sim)
+    model = build_model(config.sim, config.terrain)
     data = mujoco.MjData(model)
     renderer = mujoco.Renderer(model, height=SIZE[1], width=SIZE[0])
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False

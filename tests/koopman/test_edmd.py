@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.config import DatasetConfig, KoopmanConfig
+from kjax.config import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.koopman import edmd, models, observables
 from kjax.koopman.dataset import Snapshots
 from kjax.types import MODE_ALPHA, Mode
@@ -230,18 +230,34 @@ def test_every_figure_of_the_report_is_a_number_even_for_data_of_zeros(fit_modes
     assert not np.isnan(np.asarray(report.condition_full)).any()
 
 
-def test_fit_modes_stacks_models_over_all_contact_modes(body):
+def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contact_points():
     config = KoopmanConfig(order=1, dataset=DatasetConfig(rollouts=10, duration=0.01))
+    bounding = ((0.07, -0.24), (-0.15, -0.25))
+    body = edmd.srb_params(SrbConfig(), {Mode.FRONT: bounding, Mode.REAR: bounding})
     model, report = jax.jit(edmd.fit_modes, static_argnames="config")(
         body, config, jax.random.key(0)
     )
     assert model.A.shape == (len(Mode), 9, 9)
     assert np.asarray(report.finite).all()
-    moment = np.asarray(model.B[:, 6])
-    alpha, r = np.repeat(MODE_ALPHA, 2, axis=1), np.asarray(body.feet)
-    arms = np.array([-r[0, 1], r[0, 0], -r[1, 1], r[1, 0]])
-    # Exact but for rounding, as above.
-    np.testing.assert_allclose(moment, DT * alpha * arms / body.inertia, rtol=0, atol=1e-15)
+    for mode in Mode:
+        own = bounding if mode in (Mode.FRONT, Mode.REAR) else ((0.190, -0.250), (-0.186, -0.250))
+        (x_f, z_f), (x_r, z_r) = own
+        alpha, arms = np.repeat(MODE_ALPHA[mode], 2), np.array([-z_f, x_f, -z_r, x_r])
+        # Exact but for rounding, as above.
+        np.testing.assert_allclose(model.B[mode, 6], DT * alpha * arms / 0.394, rtol=0, atol=1e-15)
+
+
+def test_bodies_of_all_modes_differ_in_their_contact_points_only():
+    config = SrbConfig(mass=10.0, inertia=0.3, feet_front=(0.2, -0.3), feet_rear=(-0.1, -0.3))
+    other = ((0.05, -0.2), (-0.06, -0.25))
+    body = edmd.srb_params(config, {Mode.REAR: other})
+    np.testing.assert_array_equal(body.mass, np.full(len(Mode), 10.0))
+    np.testing.assert_array_equal(body.inertia, np.full(len(Mode), 0.3))
+    for mode in Mode:
+        expected = other if mode == Mode.REAR else ((0.2, -0.3), (-0.1, -0.3))
+        np.testing.assert_array_equal(body.feet[mode], expected)
+    for leaf in edmd.srb_params(config):
+        np.testing.assert_array_equal(leaf, np.broadcast_to(leaf[:1], leaf.shape))
 
 
 @pytest.mark.parametrize(

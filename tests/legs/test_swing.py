@@ -14,6 +14,7 @@ from kjax.types import Leg, Observation, RobotParams
 DURATION, APEX, ACROSS, HOLD_AFTER = 0.25, 0.06, 0.9, 0.3
 LIFT_OFF = np.array([[0.2, 0.02], [0.2, 0.02], [-0.2, 0.05], [-0.2, 0.05]])
 TARGET = np.array([[0.3, 0.02], [0.15, 0.07], [-0.1, 0.02], [-0.2, 0.05]])
+OFFSET = np.array([0.01, 0.02, -0.03, -0.04])  # m, foothold ahead of the hip
 ROUNDING = {"float32": 1e-6, "float64": 1e-14}  # ten roundings on lengths below 1 m
 
 reference = jax.jit(swing.foot_reference)
@@ -24,6 +25,7 @@ planar_state = jax.jit(kinematics.planar_state)
 
 def settings(dtype="float64"):
     values = {"apex": APEX, "horizontal_fraction": ACROSS, "hold_after": HOLD_AFTER}
+    values |= {"offset": OFFSET}
     values |= {"velocity_gain": 0.05, "kp": [200.0, 150.0, 120.0], "kd": [4.0, 3.0, 2.0]}
     return swing.SwingParams(**{name: jnp.asarray(v, dtype) for name, v in values.items()})
 
@@ -188,8 +190,8 @@ def foothold(body, remaining, stance_time, command):
     return swing.foothold(robot(dtype), settings(dtype), body, remaining, stance_time, command)
 
 
-def test_at_the_commanded_velocity_the_stance_is_symmetric_about_the_hip(dtype):
-    """The hip passes over the foot half-way through the stance to come."""
+def test_at_the_commanded_velocity_the_stance_is_symmetric_about_the_hip_and_its_offset(dtype):
+    """The hip passes the offset before the foot half-way through the stance to come."""
     v, remaining, stance = 0.6, np.array([0.1, 0.2, 0.05, 0.0]), np.array([0.2, 0.25, 0.3, 0.1])
     body = standing(x=1.5, velocity=v, dtype=dtype)
     step = foothold(
@@ -199,7 +201,7 @@ def test_at_the_commanded_velocity_the_stance_is_symmetric_about_the_hip(dtype):
         jnp.asarray(v, dtype),
     )
     hips = 1.5 + np.array([0.1881, 0.1881, -0.1881, -0.1881])
-    middle = hips + v * (remaining + stance / 2)
+    middle = hips + OFFSET + v * (remaining + stance / 2)
     # The gain times the rounded velocity error, and roundings of 1.7 m.
     np.testing.assert_allclose(step, middle, rtol=0, atol=2 * ROUNDING[dtype.name])
 
@@ -214,8 +216,26 @@ def test_too_fast_a_body_steps_further_ahead_by_the_gain():
 def test_the_foothold_is_below_the_hip_of_a_pitched_trunk():
     zero = jnp.zeros(4)
     step = foothold(standing(pitch=0.5), zero, zero, jnp.asarray(0.0))
-    expected = np.array([1, 1, -1, -1]) * 0.1881 * np.cos(0.5)
+    expected = np.array([1, 1, -1, -1]) * 0.1881 * np.cos(0.5) + OFFSET
     np.testing.assert_allclose(step, expected, rtol=1e-13)  # rounding
+
+
+def test_each_gait_has_its_own_apex_gain_and_offset(dtype):
+    """All else is shared; the gait is an index, and batches of them trace once."""
+    stacked = settings(dtype)._replace(
+        apex=jnp.asarray([0.05, 0.06, 0.07], dtype),
+        velocity_gain=jnp.asarray([0.01, 0.02, 0.03], dtype),
+        offset=jnp.asarray(np.arange(12).reshape(3, 4), dtype),
+    )
+    pick = jax.jit(chex.assert_max_traces(swing.for_gait, n=1))
+    for gait in range(3):
+        picked = pick(stacked, jnp.asarray(gait))
+        chex.assert_trees_all_equal_shapes_and_dtypes(picked, settings(dtype))
+        assert picked.apex == stacked.apex[gait]
+        assert picked.velocity_gain == stacked.velocity_gain[gait]
+        np.testing.assert_array_equal(picked.offset, np.arange(4 * gait, 4 * gait + 4))
+        for name in ("horizontal_fraction", "hold_after", "kp", "kd"):
+            np.testing.assert_array_equal(getattr(picked, name), getattr(stacked, name))
 
 
 @pytest.fixture(scope="module")

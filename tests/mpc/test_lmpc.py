@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kjax import srb
-from kjax.config import LmpcConfig
+from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman import models, observables
 from kjax.mpc import lmpc
 from kjax.qp import Status
@@ -25,13 +25,35 @@ FREE = LmpcConfig(
     force_z_min=-np.inf,
     force_z_max=np.inf,
     input_reference="hover",
+    tolerance=1e-11,
 )
+FREE_BOUND = BoundConfig(force_x_max=np.inf, force_z_min=-np.inf, force_z_max=np.inf)
 BOUNDED = LmpcConfig(horizon=4, model_dt=0.005, force_z_min=5.0, tolerance=1e-9)
+# A bound's own weights and bounds, all unlike those of the other modes.
+BOUND = BoundConfig(
+    state_weights=(900.0, 1e4, 500.0, 5.0, 2.0, 0.2),
+    input_weight=3e-5,
+    force_x_max=40.0,
+    force_z_min=20.0,
+    force_z_max=300.0,
+)
+AHEAD = 0.005 * np.arange(1, 5)  # s
 
 lift = jax.jit(observables.paper(4).lift)
-reference_trajectory = jax.jit(lmpc.reference_trajectory, static_argnames=("model_dt", "horizon"))
-build = jax.jit(lmpc.build_tables, static_argnames=("config", "data_dt", "mass"))
+reference_trajectory = jax.jit(lmpc.reference_trajectory)
+condense_all = jax.jit(lmpc.build_tables, static_argnames=("steps", "horizon"))
 solve = jax.jit(lmpc.solve_lmpc, static_argnames="config")
+
+
+def build(model, feet, config, bound):
+    """Tables of all modes, with the same contact points in each."""
+    return condense_all(
+        model,
+        lmpc.mode_settings(config, bound, MASS),
+        steps=round(config.model_dt / DT),
+        horizon=config.horizon,
+        feet=jnp.tile(feet, (len(Mode), 1, 1)),
+    )
 
 
 def cast(tree, dtype):
@@ -48,12 +70,12 @@ def model(fitted):
 
 @pytest.fixture(scope="module")
 def free(model, body):
-    return build(model, config=FREE, data_dt=DT, mass=MASS, feet=body.feet)
+    return build(model, body.feet, FREE, FREE_BOUND)
 
 
 @pytest.fixture(scope="module")
 def bounded(model, body):
-    return build(model, config=BOUNDED, data_dt=DT, mass=MASS, feet=body.feet)
+    return build(model, body.feet, BOUNDED, BOUND)
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +86,8 @@ def start():
         position=jnp.asarray(0.0),
         height=jnp.asarray(0.27),
         velocity=jnp.asarray(0.3),
-        model_dt=0.005,
-        horizon=4,
+        periodic=jnp.zeros((4, 4)),
+        ahead=jnp.asarray(AHEAD),
     )
     return x, reference
 
@@ -88,21 +110,30 @@ def horizon_by_hand(model, mode, config, x):
     return free, np.stack(columns, axis=1)
 
 
-@pytest.mark.parametrize("mode", [Mode.TROT, Mode.STAND])
+@pytest.mark.parametrize("mode", [Mode.TROT, Mode.STAND, Mode.FRONT, Mode.REAR])
 def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, free, model, start):
-    """The finite-horizon LQ problem as one weighted least-squares problem, by numpy."""
+    """The finite-horizon LQ problem as one weighted least-squares problem, by numpy.
+
+    Each mode with its own weights, and with the forces of its stance legs only.
+    """
     x, reference = start
     plan = solve(free, jnp.asarray(int(mode)), lift(x), reference, jnp.zeros(16), config=FREE)
     assert plan.status == Status.SOLVED
     response, forced = horizon_by_hand(model, mode, FREE, x)
-    Q, R = np.tile(FREE.state_weights, 4), np.full(16, FREE.input_weight)
+    own = FREE_BOUND if mode in (Mode.FRONT, Mode.REAR) else FREE
+    Q, R = np.tile(own.state_weights, 4), np.full(16, own.input_weight)
     hover = np.tile([0.0, MASS * G / MODE_ALPHA[mode].sum()], 8)
-    rows = np.concatenate([np.sqrt(Q)[:, None] * forced, np.diag(np.sqrt(R))])
+    standing = np.tile(np.repeat(MODE_ALPHA[mode] > 0, 2), 4)
+    rows = np.concatenate([np.sqrt(Q)[:, None] * forced, np.diag(np.sqrt(R))])[:, standing]
     wanted = np.concatenate([np.sqrt(Q) * (reference.ravel() - response), np.sqrt(R) * hover])
-    u = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    u = np.zeros(16)
+    # The rows of the forces left out say sqrt(R) * 0 = sqrt(R) * hover: constants.
+    u[standing] = np.linalg.lstsq(rows, wanted, rcond=None)[0]
     assert np.abs(u).max() > 20.0
-    # Rounding 2e-16 times the condition of H, 1e5, times forces of 1e3 N.
-    np.testing.assert_allclose(plan.x, u, rtol=0, atol=2e-8)
+    # Rounding 2e-16 times the condition of H, 1e5, times forces of 1e3 N. An end that is fixed to
+    # zero makes the solver iterate: tolerance times condition times forces, seen 100 times less.
+    atol = 1e-6 if mode in (Mode.FRONT, Mode.REAR) else 2e-8
+    np.testing.assert_allclose(plan.x, u, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("mode", list(Mode))
@@ -110,6 +141,7 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
 def test_plans_respect_the_bounds_and_swing_legs_get_exactly_no_force(mode, name, bounded, start):
     config = LmpcConfig(horizon=4, model_dt=0.005, force_z_min=5.0)  # default tolerance
     tables = cast(bounded, name)
+    limits = [40.0, 20.0, 300.0] if mode in (Mode.FRONT, Mode.REAR) else [60.0, 5.0, 160.0]
     for scale in (1.0, 30.0):  # the larger disturbance drives every force to a bound
         x, reference = (jnp.asarray(a, name) for a in start)
         z = lift(scale * (x - reference[0]) + reference[0])
@@ -120,11 +152,12 @@ def test_plans_respect_the_bounds_and_swing_legs_get_exactly_no_force(mode, name
             if not standing:
                 np.testing.assert_array_equal(forces[:, end], 0.0)
                 continue
-            assert (np.abs(forces[:, end, 0]) <= 60.0).all()
-            assert (forces[:, end, 1] >= 5.0).all()
-            assert (forces[:, end, 1] <= 160.0).all()
+            sideways, least, most = limits
+            assert (np.abs(forces[:, end, 0]) <= sideways).all()
+            assert (forces[:, end, 1] >= least).all()
+            assert (forces[:, end, 1] <= most).all()
     if mode != Mode.FLIGHT:
-        assert np.isin(np.abs(forces), [5.0, 60.0, 160.0]).any()
+        assert np.isin(np.abs(forces), limits).any()
 
 
 def test_tables_hold_the_model_over_one_model_step(bounded, model):
@@ -145,7 +178,7 @@ def test_contact_points_make_no_difference_to_a_model_that_ignores_them(bounded,
 
 @pytest.fixture(scope="module")
 def measured(fitted_moving_feet, body):
-    return build(fitted_moving_feet[0], config=BOUNDED, data_dt=DT, mass=MASS, feet=body.feet)
+    return build(fitted_moving_feet[0], body.feet, BOUNDED, BOUND)
 
 
 @pytest.mark.parametrize("mode", [Mode.FRONT, Mode.TROT, Mode.STAND])
@@ -230,8 +263,9 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
 
 @pytest.mark.parametrize("mode", list(Mode))
 def test_the_hover_reference_carries_the_weight(mode):
+    settings = lmpc.mode_settings(FREE, FREE_BOUND, MASS)
     lower, upper, reference = (
-        np.asarray(a)[mode].reshape(2, 2) for a in lmpc.force_bounds(FREE, MASS)
+        a[mode].reshape(2, 2) for a in (settings.lower, settings.upper, settings.input_reference)
     )
     net = MODE_ALPHA[mode] @ reference
     weight = 0.0 if mode == Mode.FLIGHT else MASS * G
@@ -244,7 +278,37 @@ def test_the_hover_reference_carries_the_weight(mode):
 
 
 def test_the_zero_input_reference_is_the_default():
-    np.testing.assert_array_equal(lmpc.force_bounds(LmpcConfig(), MASS)[2], 0.0)
+    settings = lmpc.mode_settings(LmpcConfig(), BoundConfig(), MASS)
+    np.testing.assert_array_equal(settings.input_reference, 0.0)
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_front_and_rear_stance_have_the_bound_s_weights_and_limits_and_the_others_their_own(mode):
+    settings = lmpc.mode_settings(BOUNDED, BOUND, MASS)
+    single = mode in (Mode.FRONT, Mode.REAR)
+    weights = [900.0, 1e4, 500.0, 5.0, 2.0, 0.2] if single else list(BOUNDED.state_weights)
+    np.testing.assert_array_equal(settings.state_weights[mode], weights)
+    np.testing.assert_array_equal(settings.input_weights[mode], 3e-5 if single else 1e-5)
+    standing = np.repeat(MODE_ALPHA[mode] > 0, 2)
+    lower, upper = ([-40.0, 20.0], [40.0, 300.0]) if single else ([-60.0, 5.0], [60.0, 160.0])
+    np.testing.assert_array_equal(settings.lower[mode], standing * np.tile(lower, 2))
+    np.testing.assert_array_equal(settings.upper[mode], standing * np.tile(upper, 2))
+
+
+def test_the_contact_points_of_each_mode_enter_its_own_tables(fitted_moving_feet, body):
+    model = fitted_moving_feet[0]
+    settings = lmpc.mode_settings(BOUNDED, BOUND, MASS)
+    arguments = {"steps": 5, "horizon": 4}
+    same = jnp.tile(body.feet, (len(Mode), 1, 1))
+    moved = same.at[Mode.FRONT, 0, 0].add(0.05)
+    one, other = (condense_all(model, settings, **arguments, feet=feet) for feet in (same, moved))
+    for mode in Mode:
+        change = np.abs(np.asarray(other.F[mode] - one.F[mode])).max()
+        if mode == Mode.FRONT:
+            # 5 cm more of lever arm, of about 20: a good part of the pitch terms.
+            assert change > 0.02 * np.abs(one.F[mode][:, 3]).max()
+        else:
+            assert change == 0.0, mode
 
 
 def test_the_reference_walks_ahead_at_the_commanded_velocity(dtype):
@@ -252,12 +316,27 @@ def test_the_reference_walks_ahead_at_the_commanded_velocity(dtype):
         position=jnp.asarray(1.0, dtype),
         height=jnp.asarray(0.3, dtype),
         velocity=jnp.asarray(-0.5, dtype),
-        model_dt=0.02,
-        horizon=3,
+        periodic=jnp.zeros((3, 4), dtype),
+        ahead=jnp.asarray([0.02, 0.04, 0.06], dtype),
     )
     assert reference.dtype == dtype
     expected = [[1.0 - 0.01 * i, 0.3, 0.0, -0.5, 0.0, 0.0] for i in (1, 2, 3)]
     np.testing.assert_allclose(reference, expected, rtol=2 * np.finfo(dtype).eps)
+
+
+def test_the_reference_rides_on_the_periodic_motion(dtype):
+    """Height is added to; pitch and the rates are the motion's own."""
+    reference = reference_trajectory(
+        position=jnp.asarray(1.0, dtype),
+        height=jnp.asarray(0.3, dtype),
+        velocity=jnp.asarray(0.5, dtype),
+        periodic=jnp.asarray([[0.01, 0.1, -0.2, 2.0], [-0.02, -0.3, 0.4, -5.0]], dtype),
+        ahead=jnp.asarray([0.1, 0.2], dtype),
+    )
+    assert reference.dtype == dtype
+    expected = [[1.05, 0.31, 0.1, 0.5, -0.2, 2.0], [1.1, 0.28, -0.3, 0.5, 0.4, -5.0]]
+    # Each entry is a rounded number or the sum of two.
+    np.testing.assert_allclose(reference, expected, rtol=4 * np.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize(

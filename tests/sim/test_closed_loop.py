@@ -39,16 +39,22 @@ def test_it_trots_at_the_commanded_speed_without_falling(run, simulation):
     assert result["pitch_max_deg"] < 3.0
 
 
-def test_knees_and_trunk_stay_off_the_ground_and_feet_plant(run, simulation):
-    """Replays the states in C and looks at every contact."""
-    data = mujoco.MjData(simulation.model)
-    touching = set()
+FEET_ONLY = {"ground", "FR_foot", "FL_foot", "RR_foot", "RL_foot"}
+
+
+def touching(simulation, run):
+    """Names of all geoms that were ever in contact: replays the states in C."""
+    data, names = mujoco.MjData(simulation.model), set()
     for qpos in run.qpos[::5]:
         data.qpos[:] = qpos
         mujoco.mj_forward(simulation.model, data)
         for contact in data.contact:
-            touching |= {simulation.model.geom(g).name for g in contact.geom}
-    assert touching == {"ground", "FR_foot", "FL_foot", "RR_foot", "RL_foot"}
+            names |= {simulation.model.geom(g).name for g in contact.geom}
+    return names
+
+
+def test_knees_and_trunk_stay_off_the_ground_and_feet_plant(run, simulation):
+    assert touching(simulation, run) == FEET_ONLY
     # 4 mm per stance: contact points creep in a soft friction cone, they do not slide
     assert metrics(run, simulation.config)["foot_slip_m"] < 0.004
 
@@ -152,6 +158,91 @@ def test_slip_of_a_rolling_foot_is_zero_and_of_a_dragged_one_its_path():
     assert foot_slip(made(go1.FOOT_RADIUS * angle), 1e-3, 5.0) == pytest.approx(0.0, abs=1e-12)
     dragged = made(go1.FOOT_RADIUS * angle + np.linspace(0, 0.01, steps))
     assert foot_slip(dragged, 1e-3, 5.0) == pytest.approx(0.01, abs=1e-12)
+
+
+IN_PLACE = {"command.times": [0.0], "command.velocities": [0.0]}
+
+
+@pytest.fixture(scope="module")
+def bounding():
+    """Two seconds of bounding in place, the flights growing all the while."""
+    config = load_config(RunConfig, None, IN_PLACE | {"duration": 2.0, "gait.names": ["bound"]})
+    simulation = build_simulation(config)
+    return simulation, simulate(simulation, seed=0)
+
+
+def test_it_bounds_in_place_without_falling(bounding):
+    simulation, run = bounding
+    result = metrics(run, simulation.config)
+    assert not result["fell"]
+    assert result["qp_unsolved"] == 0
+    # It drifts by 0.12 m before it settles; the reference itself pitches by 11 degrees.
+    assert abs(result["distance_m"]) < 0.3
+    assert result["pitch_max_deg"] < 35.0
+    assert 0.2 < result["height_min_m"] < result["height_max_m"] < 0.35
+
+
+def test_knees_and_trunk_stay_off_the_ground_in_a_bound(bounding):
+    assert touching(*bounding) == FEET_ONLY
+
+
+def test_all_feet_of_a_bound_leave_the_ground(bounding):
+    _, run = bounding
+    late = run.time > 1.0
+    gap = run.feet[late, :, 1].min(axis=1) - go1.FOOT_RADIUS
+    flying = (run.foot_force[late] == 0.0).all(axis=1) & (gap > 0.0)
+    # By 1 s the flights are about half of their length: 0.1 s of a cycle of 0.25 s.
+    assert flying.mean() > 0.2
+    assert gap.max() > 0.005
+
+
+def touchdowns(force):
+    """Steps at which a foot touches the ground that had been in the air for 50 ms."""
+    touch = np.flatnonzero(force > 5.0)
+    return touch[np.diff(touch, prepend=-1000) > 50]
+
+
+def test_front_feet_of_a_bound_touch_down_together_and_apart_from_the_rear_ones(bounding):
+    _, run = bounding
+    right, left = (touchdowns(run.foot_force[:, i]) for i in (0, 1))
+    assert len(right) == len(left) >= 5
+    # The robot is symmetric; a few steps by the noise of each leg's own sensors.
+    assert np.abs(right - left).max() <= 5
+    loaded = run.foot_force > 20.0
+    late = run.time > 1.0
+    both_ends = loaded[:, :2].any(axis=1) & loaded[:, 2:].any(axis=1)
+    assert both_ends[late].mean() < 0.1
+    assert loaded[late, :2].any()
+    assert loaded[late, 2:].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_trot_to_bound_and_back_in_place(seed):
+    """Bound asked for at 1 s, trot again at 2 s; with the prediction over 0.2 s."""
+    chosen = IN_PLACE | {"duration": 6.0, "lmpc.model_dt": 0.02, "lmpc.horizon": 10}
+    chosen |= {"lmpc.state_weights": [20.0, 100.0, 50.0, 6.0, 1.0, 0.15]}
+    chosen |= {"gait.names": ["trot", "bound", "trot"], "gait.times": [0.0, 1.0, 2.0]}
+    simulation = build_simulation(load_config(RunConfig, None, chosen))
+    run = simulate(simulation, seed=seed)
+    result = metrics(run, simulation.config)
+    assert not result["fell"]
+    assert result["qp_unsolved"] == 0
+
+    diagonal = (run.stance[:, 0] == run.stance[:, 3]) & (run.stance[:, 0] != run.stance[:, 1])
+    tick = 5  # steps
+    begin = int(np.argmin(diagonal))
+    assert begin == 1000
+    end = begin + int(np.argmax(diagonal[begin:]))
+    assert diagonal[end:].all()
+    # Left when front stance is over, at the first such time after 2 s: less than a cycle later.
+    assert run.stance[end - tick].tolist() == [True, True, False, False]
+    assert 2.0 <= run.time[end] < 2.35
+    # Settled: it trots as one that has never bounded.
+    last = run.time > 5.0
+    assert np.degrees(np.abs(run.x[last, 2])).max() < 5.0
+    assert np.abs(run.x[last, 3]).max() < 0.15
+    assert abs(run.x[last, 1].mean() - 0.27) < 0.01
 
 
 @pytest.mark.slow

@@ -1,0 +1,99 @@
+"""Periodic reference of a bound: height, pitch and their rates through one cycle.
+
+In a bound no constant pose is consistent with the forces: each stance lifts and turns the body and
+each flight lets it fall. The reference is the periodic motion of the rigid body under trapezoidal
+vertical forces whose impulses carry the weight over a cycle and leave no net turn:
+
+    J_f + J_r = m g T,   J_f l_f = J_r l_r
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kjax.srb import GRAVITY
+from kjax.types import MODE_ALPHA, Mode
+
+# Reference rows: deviation of height, pitch, v_z and omega.
+REFERENCE_NAMES = ("p_z", "theta", "v_z", "omega")
+SAMPLES = 51  # per phase, ends included; at most 2 ms apart in the gaits at hand
+_EDGE = 0.25  # part of a stance in which the force rises, and again in which it falls
+
+
+class PeriodicReference(NamedTuple):
+    """Periodic motion about the mean stance height, sampled per phase.
+
+    Attributes:
+      rows: (phases, SAMPLES, 4) deviation of p_z [m], theta [rad], v_z [m/s], omega [rad/s].
+      impulses: (2,) impulse of the front and of the rear pair per cycle [N s].
+    """
+
+    rows: np.ndarray
+    impulses: np.ndarray
+
+
+def periodic_reference(
+    durations: np.ndarray,
+    modes: list[Mode],
+    lever_front: float,
+    lever_rear: float,
+    mass: float,
+    inertia: float,
+) -> PeriodicReference:
+    """Periodic reference of a cycle of front, rear and flight phases.
+
+    Args:
+      durations: (phases,) length of each phase [s].
+      modes: contact mode of each phase.
+      lever_front: horizontal distance of the front feet from the centre of mass [m].
+      lever_rear: the same of the rear feet [m].
+      mass: of the body [kg].
+      inertia: about the pitch axis [kg m^2].
+
+    Raises:
+      ValueError: where front and rear do not both stand exactly once per cycle.
+    """
+    front = [i for i, mode in enumerate(modes) if MODE_ALPHA[mode, 0] > 0]
+    rear = [i for i, mode in enumerate(modes) if MODE_ALPHA[mode, 1] > 0]
+    if len(front) != 1 or len(rear) != 1 or front == rear:
+        raise ValueError(f"a bound has one front and one rear stance per cycle, got {modes}")
+    total = mass * GRAVITY * float(np.sum(durations))
+    impulses = total * np.array([lever_rear, lever_front]) / (lever_front + lever_rear)
+
+    # Integrate on a fine grid of equal cells per phase, forces at the cells' middles.
+    cells = 20 * (SAMPLES - 1)
+    middle = (np.arange(cells) + 0.5) / cells
+    shape = np.clip(np.minimum(middle, 1.0 - middle) / _EDGE, 0.0, 1.0)
+    shape /= shape.mean()
+    force = np.zeros((len(modes), cells))
+    moment = np.zeros_like(force)
+    for i, impulse, lever in (
+        (front[0], impulses[0], lever_front),
+        (rear[0], impulses[1], -lever_rear),
+    ):
+        force[i] = shape * impulse / durations[i]
+        moment[i] = lever * force[i]  # a force ahead of the body turns the nose up
+    step = np.repeat(np.asarray(durations) / cells, cells)
+    z, v_z = _periodic(force.reshape(-1) / mass - GRAVITY, step)
+    theta, omega = _periodic(moment.reshape(-1) / inertia, step)
+
+    # The mean over the two stances is zero: that is where the height reference refers to, and
+    # the trunk is level on average while it can be acted on.
+    at = np.arange(len(modes))[:, None] * cells + np.arange(SAMPLES) * (cells // (SAMPLES - 1))
+    standing = np.isin(np.arange(len(modes)), [front[0], rear[0]])
+    z = z - np.mean([z[at[i]].mean() for i in np.flatnonzero(standing)])
+    theta = theta - np.mean([theta[at[i]].mean() for i in np.flatnonzero(standing)])
+    rows = np.stack([z[at], theta[at], v_z[at], omega[at]], axis=-1)
+    return PeriodicReference(rows=rows, impulses=impulses)
+
+
+def _periodic(acceleration: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at the cell borders under a piecewise constant acceleration.
+
+    The mean velocity over the cycle is zero, so that the position returns to its start.
+    """
+    gain = np.r_[0.0, np.cumsum(acceleration * step)]
+    travel = gain[:-1] * step + 0.5 * acceleration * step**2
+    velocity = gain - travel.sum() / step.sum()
+    position = np.r_[0.0, np.cumsum(velocity[:-1] * step + 0.5 * acceleration * step**2)]
+    return position, velocity

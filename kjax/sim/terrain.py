@@ -1,0 +1,193 @@
+"""Obstacle fields as data.
+
+A kind fixes how many boxes and capsules the scene holds, a seed fixes where they lie: the scene is
+compiled once per kind, and ``place`` moves its obstacles.
+"""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from kjax.config import TerrainConfig
+
+_BOX, _CAPSULE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
+PREFIX = "obstacle_"
+_TRACK = 0.127  # m, half the distance between the left and the right feet
+_WIDE = 0.4  # m, half-width of what reaches across both tracks
+_ACROSS = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # turns a capsule's axis along y
+
+
+class Terrain(NamedTuple):
+    """Obstacles of one field (n of them).
+
+    Attributes:
+      pos: (n, 3) centres, world [m].
+      quat: (n, 4) orientations (w, x, y, z) [-].
+      size: (n, 3) MuJoCo geom sizes: half-lengths, or radius and half-length [m].
+      friction: (n,) sliding friction of a foot on it [-].
+    """
+
+    pos: np.ndarray
+    quat: np.ndarray
+    size: np.ndarray
+    friction: np.ndarray
+
+
+def shapes(config: TerrainConfig) -> list[mujoco.mjtGeom]:
+    """Geom type of every obstacle of a kind of field; the same for all its seeds."""
+    if config.kind == "flat":
+        return []
+    if config.kind == "slope":
+        return [_BOX] * 3
+    if config.kind == "paper":
+        return [_CAPSULE if i % 3 == 2 else _BOX for i in range(config.count)]
+    return [_BOX] * config.count
+
+
+def generate(config: TerrainConfig, friction: float) -> Terrain:
+    """The field of a config and its seed.
+
+    Kinds: ``paper`` (blocks, cubes and capsules in turn, on the left track, the right one or
+    both), ``blocks`` (random blocks on both tracks), ``steps`` (a flight of steps up, then down),
+    ``slope`` (up, level, down), ``patches`` (level, slippery plates).
+
+    Args:
+      config: kind, seed, extent and heights.
+      friction: of the ground, for obstacles that are no patches [-].
+    """
+    rng = np.random.default_rng([config.seed, 7])
+    make = {
+        "flat": _none,
+        "paper": _paper,
+        "blocks": _blocks,
+        "steps": _steps,
+        "slope": _slope,
+        "patches": _patches,
+    }[config.kind]
+    pos, quat, size = make(config, rng)
+    slippery = config.kind == "patches"
+    mu = np.full(len(pos), config.patch_friction if slippery else friction)
+    return Terrain(pos=pos, quat=quat, size=size, friction=mu)
+
+
+def add_obstacles(spec: mujoco.MjSpec, config: TerrainConfig, friction: float) -> None:
+    """Add a field's obstacles to a scene that is not compiled yet."""
+    terrain = generate(config, friction)
+    for i, shape in enumerate(shapes(config)):
+        spec.worldbody.add_geom(
+            name=f"{PREFIX}{i}",
+            type=shape,
+            pos=terrain.pos[i],
+            quat=terrain.quat[i],
+            size=terrain.size[i],
+            friction=[terrain.friction[i], 0.02, 0.01],
+            priority=2 if config.kind == "patches" else 0,  # feet have 1 and overrule the ground
+            contype=1,
+            conaffinity=0,
+            rgba=[0.55, 0.42, 0.30, 1.0],
+        )
+
+
+def place(model: mujoco.MjModel, terrain: Terrain) -> None:
+    """Move the obstacles of a compiled scene to another field of the same kind.
+
+    Raises:
+      ValueError: if the scene holds another number of obstacles.
+    """
+    ids = [i for i in range(model.ngeom) if model.geom(i).name.startswith(PREFIX)]
+    if len(ids) != len(terrain.pos):
+        raise ValueError(f"terrain has {len(terrain.pos)} obstacles, the scene holds {len(ids)}")
+    model.geom_pos[ids], model.geom_quat[ids] = terrain.pos, terrain.quat
+    model.geom_size[ids], model.geom_friction[ids, 0] = terrain.size, terrain.friction
+    for i, size in zip(ids, terrain.size, strict=True):
+        box = model.geom_type[i] == _BOX
+        model.geom_rbound[i] = np.linalg.norm(size) if box else size[:2].sum()
+        half = size if box else np.array([size[0], size[0], size[0] + size[1]])
+        model.geom_aabb[i] = np.r_[np.zeros(3), half]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+Field = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _none(config: TerrainConfig, rng: np.random.Generator) -> Field:
+    return np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3))
+
+
+def _paper(config: TerrainConfig, rng: np.random.Generator) -> Field:
+    pos, quat, size = [], [], []
+    for i, x in enumerate(_spread(config, rng)):
+        h = rng.uniform(config.height_min, config.height_max)
+        side = rng.integers(-1, 2)  # right track, both, left track
+        turn = rng.uniform(-1.0, 1.0)
+        y, q = float(side * _TRACK), _ACROSS
+        if i % 3 == 0:  # block
+            half = [rng.uniform(0.06, 0.12), 0.12 if side else _WIDE, h / 2]
+            q = _yaw(0.4 * turn if side else 0.0)
+        elif i % 3 == 1:  # cube, always under one track
+            half, y, q = [h / 2] * 3, float((side or 1) * _TRACK), _yaw(0.7 * turn)
+        else:  # capsule, lying across
+            half = [h / 2, 0.15 if side else _WIDE, 0.0]
+        pos.append([x, y, h / 2])
+        quat.append(q)
+        size.append(half)
+    return np.array(pos), np.array(quat), np.array(size)
+
+
+def _blocks(config: TerrainConfig, rng: np.random.Generator) -> Field:
+    x = _spread(config, rng)
+    h = rng.uniform(config.height_min, config.height_max, config.count)
+    side = rng.integers(-1, 2, config.count)
+    length = rng.uniform(0.05, 0.15, config.count)
+    size = np.stack([length, np.where(side == 0, _WIDE, 0.12), h / 2], axis=-1)
+    turn = np.where(side == 0, 0.0, rng.uniform(-0.4, 0.4, config.count))
+    pos = np.stack([x, side * _TRACK, h / 2], axis=-1)
+    return pos, np.array([_yaw(a) for a in turn]), size
+
+
+def _steps(config: TerrainConfig, rng: np.random.Generator) -> Field:
+    count = config.count
+    rise = rng.uniform(config.height_min, config.height_max, count)
+    up = (count + 1) // 2
+    level = np.cumsum(np.where(np.arange(count) < up, rise, -rise))
+    level = np.maximum(level, 0.005)
+    tread = (config.end - config.start) / count
+    x = config.start + tread * (np.arange(count) + 0.5)
+    pos = np.stack([x, np.zeros(count), level / 2], axis=-1)
+    size = np.stack([np.full(count, tread / 2), np.full(count, _WIDE), level / 2], axis=-1)
+    return pos, np.tile(_yaw(0.0), (count, 1)), size
+
+
+def _slope(config: TerrainConfig, rng: np.random.Generator) -> Field:
+    angle = np.radians(config.slope)
+    third = (config.end - config.start) / 3.0
+    top, thick = third * np.tan(angle), 0.05
+    ramp = 0.5 * third / np.cos(angle)
+    pos, quat, size = [], [], []
+    for part, (tilt, height) in enumerate(((-angle, top / 2), (0.0, top), (angle, top / 2))):
+        centre = config.start + third * (part + 0.5)
+        normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+        pos.append(np.array([centre, 0.0, height]) - thick * normal)
+        quat.append([np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0])
+        size.append([ramp if tilt else third / 2, _WIDE, thick])
+    return np.array(pos), np.array(quat), np.array(size)
+
+
+def _patches(config: TerrainConfig, rng: np.random.Generator) -> Field:
+    x = _spread(config, rng)
+    half = 0.4 * (config.end - config.start) / config.count
+    thick = 0.001
+    pos = np.stack([x, np.zeros(config.count), np.full(config.count, thick / 2)], axis=-1)
+    size = np.tile([half, _WIDE, thick / 2], (config.count, 1))
+    return pos, np.tile(_yaw(0.0), (config.count, 1)), size
+
+
+def _spread(config: TerrainConfig, rng: np.random.Generator) -> np.ndarray:
+    """Obstacle centres along the path: evenly from start to end, jittered by up to 4 cm."""
+    x = np.linspace(config.start, config.end, config.count)
+    return x + rng.uniform(-0.04, 0.04, config.count)
+
+
+def _yaw(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])

@@ -1,0 +1,157 @@
+"""Obstacle fields: data in ranges, one scene for all seeds, contacts where they should be."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from kjax.config import RunConfig, SimConfig, TerrainConfig, load_config
+from kjax.robots import go1
+from kjax.sim import terrain
+from kjax.sim.episode import initial_state
+from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.observe import resolve
+from kjax.sim.scene import build_model
+
+KINDS = ("paper", "blocks", "steps", "slope", "patches")
+
+
+def top(field, shape):
+    """Height of the highest point of each obstacle that lies flat."""
+    half = np.where(shape == mujoco.mjtGeom.mjGEOM_CAPSULE, field.size[:, 0], field.size[:, 2])
+    return field.pos[:, 2] + half
+
+
+def test_the_papers_field_has_eight_obstacles_of_5_to_7_cm_on_the_ground():
+    for seed in range(50):
+        config = TerrainConfig(kind="paper", seed=seed)
+        field = terrain.generate(config, 0.8)
+        height = top(field, np.array(terrain.shapes(config)))
+        assert len(field.pos) == 8
+        assert ((height >= 0.05) & (height <= 0.07)).all()
+        np.testing.assert_allclose(height, 2 * field.pos[:, 2], atol=1e-12)
+        assert ((field.pos[:, 0] > 0.75) & (field.pos[:, 0] < 2.65)).all()
+        assert (np.diff(field.pos[:, 0]) > 0).all()
+
+
+def test_blocks_cubes_and_capsules_take_turns():
+    field = terrain.generate(TerrainConfig(kind="paper"), 0.8)
+    shapes = terrain.shapes(TerrainConfig(kind="paper"))
+    for i, shape in enumerate(shapes):
+        assert (shape == mujoco.mjtGeom.mjGEOM_CAPSULE) == (i % 3 == 2)
+        if i % 3 == 1:
+            assert np.ptp(field.size[i]) == 0.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_gives_its_field_again_and_another_seed_another(kind):
+    def make(seed):
+        return terrain.generate(TerrainConfig(kind=kind, seed=seed), 0.8)
+
+    for a, b in zip(make(3), make(3), strict=True):
+        np.testing.assert_array_equal(a, b)
+    different = any((a != b).any() for a, b in zip(make(3), make(4), strict=True))
+    assert different == (kind != "slope")  # a slope has nothing random in it
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
+    """Same physics: a ball dropped on the moved field does what it does on the compiled one."""
+    first = TerrainConfig(kind=kind, seed=1)
+    second = TerrainConfig(kind=kind, seed=2)
+    moved = build_model(SimConfig(), first)
+    terrain.place(moved, terrain.generate(second, 0.8))
+    compiled = build_model(SimConfig(), second)
+    for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(compiled, name), atol=1e-12)
+    np.testing.assert_allclose(moved.geom_aabb, compiled.geom_aabb, atol=1e-12)
+    states = []
+    for model in (moved, compiled):
+        data = mujoco.MjData(model)
+        height, joints = go1.stand_pose(0.27)
+        data.qpos[resolve(model).qpos] = joints
+        data.qpos[:2] = 1.0, height + 0.1
+        mujoco.mj_step(model, data, 300)
+        states.append(data.qpos.copy())
+    np.testing.assert_array_equal(*states)
+
+
+def test_a_field_of_another_size_is_refused():
+    model = build_model(SimConfig(), TerrainConfig(kind="paper"))
+    with pytest.raises(ValueError, match="3 obstacles, the scene holds 8"):
+        terrain.place(model, terrain.generate(TerrainConfig(kind="slope"), 0.8))
+
+
+def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
+    config = TerrainConfig(kind="slope", slope=10.0)
+    model = build_model(SimConfig(), config)
+    data = mujoco.MjData(model)
+    data.qpos[1] = 5.0  # the robot out of the way
+    mujoco.mj_forward(model, data)
+
+    def height(x):
+        geom = np.zeros(1, np.int32)
+        down = np.array([0.0, 0.0, -1.0])
+        ray = mujoco.mj_ray(model, data, np.array([x, 0.0, 3.0]), down, None, 1, -1, geom, None)
+        return 3.0 - ray
+
+    rise = np.tan(np.radians(10.0))
+    for x in (0.9, 1.1, 1.3):
+        assert height(x) == pytest.approx((x - config.start) * rise, abs=1e-6)
+        mirrored = config.start + config.end - x
+        assert height(mirrored) == pytest.approx(height(x), abs=1e-6)
+    assert height(1.7) == pytest.approx(0.6 * rise, abs=1e-6)
+
+
+def test_a_patch_is_slippery_under_a_foot():
+    """A foot's priority overrules the ground's friction; a patch overrules the foot's."""
+    config = TerrainConfig(kind="patches", patch_friction=0.2, start=0.19, end=0.6, count=1)
+    model = build_model(SimConfig(), config)
+    data = mujoco.MjData(model)
+    height, joints = go1.stand_pose(0.27)
+    data.qpos[resolve(model).qpos] = joints
+    data.qpos[1] = height
+    mujoco.mj_forward(model, data)
+    friction = {}
+    for contact in data.contact:
+        names = {model.geom(g).name for g in contact.geom}
+        patch = any(name.startswith(terrain.PREFIX) for name in names)
+        friction.setdefault(patch, set()).add(round(float(contact.friction[0]), 6))
+    assert friction == {True: {0.2}, False: {0.8}}
+
+
+def test_the_height_reference_follows_the_ground_under_the_stance_feet():
+    """Standing on a plateau: without it the robot would sink onto its knees."""
+    rise = 0.06
+    common = {
+        "duration": 1.0,
+        "command.times": [0.0],
+        "command.velocities": [0.0],
+        "terrain.kind": "steps",
+        "terrain.count": 1,
+        "terrain.start": 0.001,
+        "terrain.end": 4.0,
+        "terrain.height_min": rise,
+        "terrain.height_max": rise,
+        "noise.enabled": False,
+        "lmpc.input_reference": "hover",
+    }
+
+    def mean_height(above):
+        config = load_config(RunConfig, None, {**common, "lmpc.height_above": above})
+        simulation = build_simulation(config)
+        original = initial_state(config, 15, 15)
+        lifted = original[0].copy()
+        lifted[:2] += 1.0, rise
+
+        def start(config, nq, nv):
+            return lifted, original[1]
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("kjax.sim.mujoco_loop.initial_state", start)
+            run = simulate(simulation)
+        assert not run.fell
+        return run.x[-200:, 1].mean()
+
+    # 5 mm: what is left of the droop under the legs' own weight
+    assert mean_height("feet") == pytest.approx(0.27 + rise, abs=0.005)
+    assert mean_height("ground") < 0.27 + rise - 0.02
