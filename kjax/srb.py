@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-GRAVITY = 9.81  # m/s^2, MuJoCo's default
+from kjax.types import GRAVITY
 
 
 class SrbParams(NamedTuple):

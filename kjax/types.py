@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+GRAVITY = 9.81  # m/s^2, MuJoCo's default
+
 STATE_NAMES = ("p_x", "p_z", "theta", "v_x", "v_z", "omega")
 STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 STATE_DIM = len(STATE_NAMES)

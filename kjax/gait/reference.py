@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kjax.srb import GRAVITY
-from kjax.types import MODE_ALPHA, Mode
+from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 # Reference rows: deviation of height, pitch, v_z and omega.
 REFERENCE_NAMES = ("p_z", "theta", "v_z", "omega")

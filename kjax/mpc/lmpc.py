@@ -15,8 +15,7 @@ from kjax import qp
 from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman.models import LinearModel, aggregate, input_map
 from kjax.mpc.condense import condense
-from kjax.srb import GRAVITY
-from kjax.types import MODE_ALPHA, Mode
+from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 
 class LmpcTables(NamedTuple):

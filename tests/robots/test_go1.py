@@ -10,8 +10,7 @@ import pytest
 from kjax.config import LmpcConfig, SrbConfig
 from kjax.legs.kinematics import KNEE_RANGE
 from kjax.robots import go1
-from kjax.srb import GRAVITY
-from kjax.types import Leg
+from kjax.types import GRAVITY, Leg
 
 LINKS = ("hip", "thigh", "calf")
 
