@@ -392,6 +392,37 @@ def test_the_rule_says_in_which_phases_a_bound_may_be_left(rule, free):
     assert all(phase.may_leave for phase in trot.phases + stand.phases)
 
 
+@pytest.mark.parametrize(("slew", "ticks"), [(4.0, 25), (10.0, 10), (np.inf, 1)])
+def test_the_reference_velocity_follows_the_command_at_its_largest_rate(
+    controller, plan, slew, ticks
+):
+    """From rest to -0.5 m/s at 200 Hz, and the reference position is its integral."""
+    chosen = {"command.velocities": [-0.5] * 5, "lmpc.command_slew": slew}
+    chosen |= {"lmpc.position_slack": 1.0}
+    params = build_params(load_config(RunConfig, None, chosen), go1.PARAMS)
+    observation = standing()
+    begin = float(controller.init(params, observation).position)
+    states, infos = plans(controller, params, plan, 30)
+    ramp = -0.5 * np.minimum(np.arange(1, 31) / ticks, 1.0)
+    # Sums of up to 30 terms, rounded.
+    np.testing.assert_allclose(states.velocity, ramp, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(infos.reference[:, 3], ramp, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(states.position, begin + 0.005 * np.cumsum(ramp), rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(states.velocity_command, -0.5)
+
+
+@pytest.mark.parametrize(("above", "rise"), [("feet", 0.07), ("ground", 0.0)])
+def test_the_reference_height_is_above_the_stance_feet_or_above_zero(controller, plan, above, rise):
+    """All feet 0.07 m up; then in the air, where the height of the last stance holds on."""
+    config = bounding(**{"lmpc.height_above": above, "bound.reference": "constant"})
+    params = build_params(config, go1.PARAMS)
+    high = standing(base_pos=standing().base_pos + np.array([0.0, 0.0, 0.07]))
+    _, infos = plans(controller, params, plan, 30, high)
+    assert set(infos.mode.tolist()) == {Mode.FRONT, Mode.FLIGHT}
+    # Rounding of the legs' kinematics.
+    np.testing.assert_allclose(infos.reference[:, 1], 0.27 + rise, rtol=0, atol=1e-12)
+
+
 def test_footholds_of_a_bound_lie_closer_under_the_body(controller, bound_params, plan):
     """Standing, the feet of a swing end as far from the trunk's middle as the config says."""
     offset = np.asarray(bound_params.swing.offset)
