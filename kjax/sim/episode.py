@@ -96,17 +96,27 @@ def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.n
     return qpos, qvel
 
 
-def sensor_noise(config: RunConfig, steps: int) -> np.ndarray:
-    """Noise (steps, 30) of an episode; entry i depends on the seed and i only."""
+def sensor_noise(config: RunConfig, steps: int, start: int = 0) -> np.ndarray:
+    """Noise (steps, 30) of an episode from step ``start`` on.
+
+    The noise of a step depends on the seed and the step's number only, so that episodes may be
+    drawn in pieces and are the same on every engine.
+    """
     scale = noise_scale(config.noise)
     if not scale.any():
         return np.zeros((steps, NOISE_DIM))
     key = jax.random.fold_in(jax.random.key(config.seed), 1)
+    return np.asarray(_normals(key, np.arange(start, start + steps)), float) * scale
 
-    def one(i: jax.Array) -> jax.Array:
-        return jax.random.normal(jax.random.fold_in(key, i), (NOISE_DIM,), jnp.float32)
 
-    return np.asarray(jax.jit(jax.vmap(one))(jnp.arange(steps)), float) * scale
+@jax.jit
+def _normals(key: jax.Array, steps: jax.Array) -> jax.Array:
+    """Standard normal vectors (steps, 30), one stream per step."""
+
+    def one(step: jax.Array) -> jax.Array:
+        return jax.random.normal(jax.random.fold_in(key, step), (NOISE_DIM,), jnp.float32)
+
+    return jax.vmap(one)(steps)
 
 
 def sagittal(observe: Observe, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,10 @@
 """One robot in C MuJoCo: the physics steps in C, the controller in two jitted calls."""
 
 import dataclasses
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +32,9 @@ from kjax.types import Observation
 # Called once per control tick with the steps done, the steps in all and the data; return value
 # ignored. For progress bars and viewers.
 OnTick = Callable[[int, int, mujoco.MjData], None]
+
+
+_NOISE_TICKS = 1000  # noise is drawn for so many ticks at once
 
 
 class TickLog(NamedTuple):
@@ -154,6 +159,33 @@ def build_simulation(config: RunConfig) -> Simulation:
     return simulation
 
 
+def _until_ctrl_c(ticks: Iterable[int]) -> Iterator[int]:
+    """The ticks, until Ctrl-C: then KeyboardInterrupt between two ticks.
+
+    Python's own handler may raise inside a compiled call, which can take the process down. A
+    second Ctrl-C goes to the handler that was there before.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield from ticks  # signals are the main thread's
+        return
+    asked = False
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: Any) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        for tick in ticks:
+            if asked:
+                raise KeyboardInterrupt
+            yield tick
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def simulate(
     simulation: Simulation,
     *,
@@ -184,7 +216,9 @@ def simulate(
     per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
     ticks = -(-round(config.duration / config.sim.sim_dt) // per_tick)
     steps = ticks * per_tick
-    noise = sensor_noise(config, steps)
+    # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
+    piece = _NOISE_TICKS * per_tick
+    noise = sensor_noise(config, piece)
     sensed = np.zeros(model.nq + model.nv + model.nsensordata + NOISE_DIM)
     cuts = np.cumsum([model.nq, model.nv, model.nsensordata])
 
@@ -192,7 +226,7 @@ def simulate(
         sensed[: cuts[0]] = data.qpos
         sensed[cuts[0] : cuts[1]] = data.qvel
         sensed[cuts[1] : cuts[2]] = data.sensordata
-        sensed[cuts[2] :] = noise[step]
+        sensed[cuts[2] :] = noise[step % piece]
         return sensed
 
     qpos, qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
@@ -207,7 +241,9 @@ def simulate(
     done = 0
     begin = time.perf_counter()
     try:
-        for tick in range(ticks):
+        for tick in _until_ctrl_c(range(ticks)):
+            if tick > 0 and tick % _NOISE_TICKS == 0:
+                noise = sensor_noise(config, piece, tick * per_tick)
             sense(tick * per_tick)
             clock = time.perf_counter()
             state, log = simulation.plan(state, sensed)

@@ -118,7 +118,9 @@ def test_a_trajectory_survives_saving(run, tmp_path):
 
 def test_noise_of_a_step_does_not_depend_on_the_length_of_the_run():
     config = RunConfig(seed=3)
-    np.testing.assert_array_equal(sensor_noise(config, 50)[:20], sensor_noise(config, 20))
+    whole = sensor_noise(config, 50)
+    np.testing.assert_array_equal(whole[:20], sensor_noise(config, 20))
+    np.testing.assert_array_equal(whole[30:], sensor_noise(config, 20, start=30))
     spread = sensor_noise(config, 4000).std(axis=0)
     # 5 %: the standard error of a standard deviation of 4000 samples is 1.1 %
     np.testing.assert_allclose(spread[:3], [0.001, 0.001, 0.003], rtol=0.05)
