@@ -175,7 +175,10 @@ def test_gravity_is_the_models(model):
 
 def test_the_robot_can_stand_at_the_default_height_within_its_torque_limits():
     heights = {field.name: field.default for field in dataclasses.fields(LmpcConfig)}
-    go1.stand_pose(heights["height"])
+    _, joints = go1.stand_pose(heights["height"])
+    # Feet lie below the hips: the lever of a quarter of the weight is the knee's way back.
+    knee = go1.PARAMS.mass * GRAVITY / 4 * go1.THIGH_LENGTH * np.sin(joints[0, 1])
+    assert 0.0 < knee < 0.5 * go1.PARAMS.torque_limit[2]
 
 
 def test_the_model_needs_no_mesh_or_texture_file(model):
