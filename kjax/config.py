@@ -5,9 +5,10 @@ Every field's docstring ends with its unit in brackets; ``--help`` of the experi
 
 import dataclasses
 import difflib
+import itertools
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -31,6 +32,27 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the message names file, key, value and wish."""
 
 
+def _require_timeline(times: Sequence[float], name: str, values: Sequence[object]) -> None:
+    """Refuse pieces in time that are not as many as their values, or not in order from 0 on."""
+    if not times or len(times) != len(values):
+        raise ValueError(
+            f"times and {name} must be equally long and not empty, got {len(times)} and "
+            f"{len(values)}"
+        )
+    if times[0] != 0.0:
+        raise ValueError(f"times must start at 0, got {list(times)}")
+    if any(b <= a for a, b in itertools.pairwise(times)):
+        raise ValueError(f"times must increase, got {list(times)}")
+
+
+def _require_multiple(name: str, value: float, base_name: str, base: float) -> None:
+    ratio = value / base
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
+        raise ValueError(
+            f"{name} must be a whole multiple of {base_name}, got {value} s and {base} s"
+        )
+
+
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class CommandConfig:
     """Forward velocity command: a step function of time."""
@@ -42,15 +64,7 @@ class CommandConfig:
 
     @model_validator(mode="after")
     def _check(self) -> "CommandConfig":
-        if len(self.times) != len(self.velocities):
-            raise ValueError(
-                f"times and velocities must be equally long, got {len(self.times)} and "
-                f"{len(self.velocities)}"
-            )
-        if not self.times or self.times[0] != 0.0:
-            raise ValueError(f"times must start at 0, got {list(self.times)}")
-        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
-            raise ValueError(f"times must increase, got {list(self.times)}")
+        _require_timeline(self.times, "velocities", self.velocities)
         return self
 
 
@@ -191,15 +205,7 @@ class GaitConfig:
 
     @model_validator(mode="after")
     def _check(self) -> "GaitConfig":
-        if len(self.names) != len(self.times) or not self.names:
-            raise ValueError(
-                f"names and times must be equally long and not empty, got {len(self.names)} and "
-                f"{len(self.times)}"
-            )
-        if self.times[0] != 0.0:
-            raise ValueError(f"times must start at 0, got {list(self.times)}")
-        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
-            raise ValueError(f"times must increase, got {list(self.times)}")
+        _require_timeline(self.times, "names", self.names)
         return self
 
 
@@ -442,14 +448,6 @@ class FitStudyConfig:
             "test_duration", self.test_duration, "koopman.dataset.dt", self.koopman.dataset.dt
         )
         return self
-
-
-def _require_multiple(name: str, value: float, base_name: str, base: float) -> None:
-    ratio = value / base
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
-        raise ValueError(
-            f"{name} must be a whole multiple of {base_name}, got {value} s and {base} s"
-        )
 
 
 def fields(cls: type, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
