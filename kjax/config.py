@@ -53,6 +53,14 @@ def _require_multiple(name: str, value: float, base_name: str, base: float) -> N
         )
 
 
+def _require_order(config: Any) -> None:
+    if not config.force_z_min <= config.force_z_max:
+        raise ValueError(
+            f"force_z_min must not exceed force_z_max, got {config.force_z_min} and "
+            f"{config.force_z_max}"
+        )
+
+
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class CommandConfig:
     """Forward velocity command: a step function of time."""
@@ -164,6 +172,10 @@ class LmpcConfig:
     """What the reference height is measured from: z = 0, or the stance feet (rough ground) [-]."""
     command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
     """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
+    integral_gains: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """Rates at which the errors of velocity and pitch move their references; 0: not [1/s]."""
+    integral_limits: tuple[NonNegative, NonNegative] = (0.15, 0.15)
+    """Largest correction of velocity and pitch reference by that [m/s, rad]."""
     position_slack: Positive = 0.10
     """Largest lead or lag of the integrated position reference before the body [m]."""
     solver: Literal["admm", "projected_gradient"] = "admm"
@@ -175,11 +187,7 @@ class LmpcConfig:
 
     @model_validator(mode="after")
     def _check(self) -> "LmpcConfig":
-        if not self.force_z_min <= self.force_z_max:
-            raise ValueError(
-                f"force_z_min must not exceed force_z_max, got {self.force_z_min} and "
-                f"{self.force_z_max}"
-            )
+        _require_order(self)
         return self
 
 
@@ -229,6 +237,9 @@ class BoundConfig:
     """Distance of the front footholds ahead of the centre of mass, standing still [m]."""
     feet_rear: Positive = 0.148
     """Distance of the rear footholds behind the centre of mass, standing still [m]."""
+    horizon: Literal["stance", "multiphase"] = "stance"
+    """What the prediction covers: the present stance (the paper), or a whole cycle ([multiphase],
+    which then has the weights and bounds) [-]."""
     reference: Literal["periodic", "constant"] = "periodic"
     """Reference of height and pitch: the cycle's own motion, or constant (the paper) [-]."""
     height: Positive = 0.27
@@ -252,11 +263,46 @@ class BoundConfig:
 
     @model_validator(mode="after")
     def _check(self) -> "BoundConfig":
-        if not self.force_z_min <= self.force_z_max:
-            raise ValueError(
-                f"force_z_min must not exceed force_z_max, got {self.force_z_min} and "
-                f"{self.force_z_max}"
-            )
+        _require_order(self)
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class MultiPhaseConfig:
+    """LMPC of the bound over one gait cycle, through flight; for bound.horizon = "multiphase"."""
+
+    node_dt: Positive = 0.0125
+    """Longest node of a stance; a flight is one node [s]."""
+    state_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (16.0, 151.0, 13.8, 38.2, 2.67, 0.145)
+    """Q of (p_x, p_z, theta, v_x, v_z, omega), per second [1/s times that of bound]."""
+    input_weight: Positive = 1.7e-6
+    """R of every force's distance from the periodic one, per second [1/(N^2 s)]."""
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 135.0
+    """Bound of |F_x| per leg, world frame [N]."""
+    force_z_min: Bound = 10.0
+    """Lower bound of F_z per leg, world frame [N]."""
+    force_z_max: Bound = 250.0
+    """Upper bound of F_z per leg, world frame [N]."""
+    friction: Positive = 0.6
+    """mu of the pyramid |F_x| <= mu F_z; below the ground's, for margin [-]."""
+    torque_fraction: Annotated[float, Field(gt=0, le=1)] = 0.95
+    """Part of the thigh's and the calf's torque limit that planned forces may take [-]."""
+    inertia_scale: Positive = 0.87
+    """Pitch inertia of the prediction over srb.inertia: legs in swing count for less [-]."""
+    velocity_time: Positive = 0.3
+    """Time in which the velocity is predicted to reach its reference, for moment arms [s]."""
+    height_time: Positive = 0.05
+    """The same of height and pitch [s]."""
+    tolerance: Positive = 1e-6
+    """Relative residuals and gap at which the QP counts as solved [-]."""
+    max_iterations: Count = 30
+    """Iteration limit of the interior point [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "MultiPhaseConfig":
+        _require_order(self)
         return self
 
 
@@ -384,6 +430,8 @@ class RunConfig:
     """Gait."""
     bound: BoundConfig = BoundConfig()
     """Bound."""
+    multiphase: MultiPhaseConfig = MultiPhaseConfig()
+    """Multi-phase horizon of the bound."""
     leg: LegConfig = LegConfig()
     """Swing legs."""
     sim: SimConfig = SimConfig()

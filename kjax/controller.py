@@ -21,6 +21,7 @@ from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
 from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState, planar_state
 from kjax.legs.stance import stance_torque
+from kjax.mpc import multiphase
 from kjax.mpc.lmpc import (
     LmpcTables,
     build_tables,
@@ -43,11 +44,14 @@ class ControllerParams(NamedTuple):
       gaits: (K,) index of the gait asked for then.
       reference: (G, ramp levels, P, samples, 4) periodic motion of each gait; see
         ``gait.reference``.
+      multiphase: LMPC over a gait cycle, for gaits that use it.
       swing: swing settings.
       command: forward velocity over time.
       height: (G,) mean height of the centre of mass [m].
       follow_ground: 1 to measure it from the stance feet, 0 from z = 0 [-].
       command_slew: largest rate of change of the reference velocity [m/s^2].
+      integral: (2, 2) integral action on velocity and pitch: its rates [1/s] and its limits
+        [m/s, rad].
       position_slack: clamp of the position reference [m].
     """
 
@@ -57,11 +61,13 @@ class ControllerParams(NamedTuple):
     gait_times: Float[Array, "K"]
     gaits: Int[Array, "K"]
     reference: Float[Array, "G levels P samples 4"]
+    multiphase: multiphase.MultiPhaseParams
     swing: swing.SwingParams
     command: Command
     height: Float[Array, "G"]
     follow_ground: Float[Array, ""]
     command_slew: Float[Array, ""]
+    integral: Float[Array, "2 2"]
     position_slack: Float[Array, ""]
 
 
@@ -76,6 +82,8 @@ class ControllerState(NamedTuple):
       velocity_command: velocity commanded now [m/s].
       ground: height of the ground under the last stance feet [m].
       velocity: reference of v_x, which follows the command at a bounded rate [m/s].
+      correction: integrals of the errors of velocity and pitch, added to their references
+        [m/s, rad].
       plan: (4k,) last force plan, body frame [N].
       force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
       swing: state of the swing legs.
@@ -88,6 +96,7 @@ class ControllerState(NamedTuple):
     velocity_command: Float[Array, ""]
     ground: Float[Array, ""]
     velocity: Float[Array, ""]
+    correction: Float[Array, "2"]
     plan: Float[Array, "nu"]
     force: Float[Array, "4 2"]
     swing: swing.SwingState
@@ -111,6 +120,17 @@ class PlanInfo(NamedTuple):
     iterations: Int[Array, ""]
     mode: Int[Array, ""]
     x: Float[Array, "6"]
+    reference: Float[Array, "6"]
+
+
+class _Forces(NamedTuple):
+    """What a scheme of prediction returns: forces (2, 2) per foot of each end, and the rest."""
+
+    ends: Float[Array, "2 2"]
+    plan: Float[Array, "nu"]
+    status: Int[Array, ""]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
     reference: Float[Array, "6"]
 
 
@@ -145,6 +165,8 @@ def build_controller(config: RunConfig) -> Controller:
     sim_dt = config.sim.sim_dt
     lift = build_dictionary(config.koopman).lift
     measured_feet = config.koopman.feet == "measured"
+    cycle_nodes = int(_cycle_nodes(build_gaits(config), config).sum(axis=1).max())
+    cycle_nodes += cycle_nodes > 0  # the present phase may hold one more, part now and part later
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
         body = planar_state(params.robot, _cast(observation, params))
@@ -157,6 +179,7 @@ def build_controller(config: RunConfig) -> Controller:
             velocity_command=zero,
             ground=zero,
             velocity=zero,
+            correction=jnp.zeros((2,), zero.dtype),
             plan=jnp.zeros_like(params.tables.lower[0]),
             force=jnp.zeros((4, 2), zero.dtype),
             swing=swing.initial_swing(body.feet),
@@ -185,36 +208,115 @@ def build_controller(config: RunConfig) -> Controller:
         command = params.command.velocities[_piece(params.command.times, state.time)]
         change = params.command_slew * lmpc.control_dt
         velocity = state.velocity + jnp.clip(command - state.velocity, -change, change)
+        now = _periodic_rows(
+            params, clock, clock.phase[None], jnp.zeros_like(clock.phase)[None], clock.elapsed[None]
+        )[0]
+        error = jnp.stack([velocity - body.x[3], now[1] - body.x[2]])
+        rate, limit = params.integral
+        # Errors beyond the limit are a step on its way, not a bias.
+        correction = state.correction + rate * lmpc.control_dt * jnp.clip(error, -limit, limit)
+        correction = jnp.clip(correction, -limit, limit)
+        target = velocity + correction[0]
+        lean = jnp.stack([jnp.zeros_like(target), correction[1]] + [jnp.zeros_like(target)] * 2)
         slack = params.position_slack
         position = jnp.clip(
-            state.position + velocity * lmpc.control_dt, body.x[0] - slack, body.x[0] + slack
+            state.position + target * lmpc.control_dt, body.x[0] - slack, body.x[0] + slack
         )
+        contact = _contact_points(params.robot, body, stance)
         count = jnp.sum(stance)
         under = jnp.sum(jnp.where(stance, body.feet[:, 1] - params.robot.foot_radius, 0.0))
         ground = jnp.where(count > 0, under / jnp.maximum(count, 1), state.ground)
-        ahead = lmpc.model_dt * jnp.arange(1, lmpc.horizon + 1, dtype=position.dtype)
-        reference = reference_trajectory(
-            position=position,
-            velocity=velocity,
-            height=params.height[clock.gait] + params.follow_ground * ground,
-            periodic=_periodic_rows(params, clock, clock.elapsed + ahead),
-            ahead=ahead,
-        )
-        warm = shift_plan(state.plan, lmpc)
-        solution = solve_lmpc(
-            params.tables,
-            mode,
-            lift(body.x),
-            reference,
-            warm,
-            lmpc,
-            feet=_contact_points(params.robot, body, stance) if measured_feet else None,
-        )
-        # Out of iterations, the solver's point is feasible and no worse than its start; only
-        # faulty data makes the shifted last plan the better choice.
-        usable = (solution.status <= qp.Status.ITERATION_LIMIT) & readable
-        fallback = jnp.clip(warm, params.tables.lower[mode], params.tables.upper[mode])
-        forces = jnp.where(usable, solution.x, fallback)
+        height = params.height[clock.gait] + params.follow_ground * ground
+
+        def within_stance() -> _Forces:
+            ahead = lmpc.model_dt * jnp.arange(1, lmpc.horizon + 1, dtype=position.dtype)
+            phases = jnp.broadcast_to(clock.phase, ahead.shape)
+            reference = reference_trajectory(
+                position=position,
+                velocity=target,
+                height=height,
+                periodic=lean
+                + _periodic_rows(
+                    params, clock, phases, jnp.zeros_like(phases), clock.elapsed + ahead
+                ),
+                ahead=ahead,
+            )
+            warm = shift_plan(state.plan, lmpc)
+            solution = solve_lmpc(
+                params.tables,
+                mode,
+                lift(body.x),
+                reference,
+                warm,
+                lmpc,
+                feet=contact @ body.rotation if measured_feet else None,
+            )
+            # Out of iterations, the solver's point is feasible and no worse than its start; only
+            # faulty data makes the shifted last plan the better choice.
+            usable = (solution.status <= qp.Status.ITERATION_LIMIT) & readable
+            fallback = jnp.clip(warm, params.tables.lower[mode], params.tables.upper[mode])
+            forces = jnp.where(usable, solution.x, fallback)
+            return _Forces(
+                forces[:4].reshape(2, 2),
+                forces,
+                solution.status,
+                solution.residual,
+                solution.iterations,
+                reference[0],
+            )
+
+        def over_a_cycle() -> _Forces:
+            settings = params.multiphase
+            nodes = multiphase.build_nodes(
+                settings, schedule, clock, cycle_nodes, shortest=0.5 * lmpc.control_dt
+            )
+            outlook = multiphase.predict(
+                settings,
+                nodes,
+                body.x,
+                position=position,
+                velocity=target,
+                command=command + correction[0],
+                slew=params.command_slew,
+                height=height,
+                ground=ground,
+                periodic=lean
+                + _periodic_rows(
+                    params, clock, nodes.phase, nodes.cycle - clock.cycle, nodes.place
+                ),
+                contact=contact + body.x[:2],
+                stance_time=schedule.duration[clock.gait, nodes.phase],
+                cycle_time=nodes.end[-1],
+            )
+            solved = multiphase.solve(
+                settings,
+                params.robot,
+                nodes,
+                outlook,
+                body.x,
+                (body.x[:2] - body.base) @ body.rotation,
+                tolerance=config.multiphase.tolerance,
+                max_iterations=config.multiphase.max_iterations,
+            )
+            # A point that misses its rows by a percent still walks better than none.
+            usable = (solved.status <= qp.Status.ITERATION_LIMIT) & (solved.residual < 1e-2)
+            carry = jnp.stack([jnp.zeros_like(outlook.force_z[0]), outlook.force_z[0]])
+            first = jnp.where(usable & readable, solved.force[0], carry) @ body.rotation
+            standing = jnp.arange(2) == nodes.end_index[0]
+            return _Forces(
+                jnp.where(standing[:, None], first, 0.0),
+                jnp.zeros_like(state.plan),
+                solved.status,
+                solved.residual,
+                solved.iterations,
+                outlook.reference[0],
+            )
+
+        if cycle_nodes:
+            crossing = (params.multiphase.nodes[clock.gait].sum() > 0) & stance.any()
+            solved = jax.lax.cond(crossing, over_a_cycle, within_stance)
+        else:
+            solved = within_stance()
 
         moved = ControllerState(
             time=state.time + lmpc.control_dt,
@@ -224,17 +326,18 @@ def build_controller(config: RunConfig) -> Controller:
             velocity_command=command,
             ground=jnp.where(readable, ground, state.ground),
             velocity=velocity,
-            plan=forces,
-            force=forces[:4].reshape(2, 2)[LEG_PAIR] * stance[:, None],
+            correction=jnp.where(readable, correction, state.correction),
+            plan=solved.plan,
+            force=solved.ends[LEG_PAIR] * stance[:, None],
             swing=jax.tree.map(lambda new, old: jnp.where(readable, new, old), swings, state.swing),
         )
         info = PlanInfo(
-            status=jnp.where(readable, solution.status, qp.Status.NON_FINITE).astype(jnp.int32),
-            residual=jnp.where(readable, solution.residual, jnp.inf),
-            iterations=solution.iterations,
+            status=jnp.where(readable, solved.status, qp.Status.NON_FINITE).astype(jnp.int32),
+            residual=jnp.where(readable, solved.residual, jnp.inf),
+            iterations=solved.iterations,
             mode=mode,
             x=body.x,
-            reference=reference[0],
+            reference=solved.reference,
         )
         return moved, info
 
@@ -263,7 +366,7 @@ def build_controller(config: RunConfig) -> Controller:
             body,
             jnp.maximum(swings.duration - swings.elapsed, 0.0),
             params.schedule.stance_time[where],
-            state.velocity,
+            state.velocity + state.correction[0],
         )
         target = jnp.stack([x_target, jnp.full_like(x_target, robot.foot_radius)], axis=-1)
         position, velocity = swing.foot_reference(settings, swings, target)
@@ -327,6 +430,7 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
             gait_times=jnp.asarray(config.gait.times),
             gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
             reference=jnp.asarray(_reference_tables(gaits, config)),
+            multiphase=_multiphase_params(gaits, config, robot),
             swing=swing.SwingParams(
                 apex=jnp.asarray(np.where(is_bound, bound.apex, leg.apex)),
                 velocity_gain=jnp.asarray(
@@ -345,6 +449,7 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
             height=jnp.asarray(np.where(is_bound, bound.height, config.lmpc.height)),
             follow_ground=jnp.asarray(float(config.lmpc.height_above == "feet")),
             command_slew=jnp.asarray(config.lmpc.command_slew, float),
+            integral=jnp.asarray([config.lmpc.integral_gains, config.lmpc.integral_limits]),
             position_slack=jnp.asarray(config.lmpc.position_slack),
         )
         params = jax.device_get(params)
@@ -374,6 +479,39 @@ def build_gaits(config: RunConfig) -> list[gait.Gait]:
         gait.stand(),
     ]
     return [*gaits, gait.stand(chosen.landing_time, name=landing)] if landing else gaits
+
+
+def _cycle_nodes(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
+    """Number of nodes (G, P) of each phase; zero for gaits that predict within a stance only."""
+    nodes = np.zeros((len(gaits), max(len(g.phases) for g in gaits)), int)
+    for index, one in enumerate(gaits):
+        if one.name != "bound" or config.bound.horizon != "multiphase":
+            continue
+        for place, phase in enumerate(one.phases):
+            parts = np.ceil(phase.duration / config.multiphase.node_dt - 1e-9)
+            nodes[index, place] = 1 if phase.mode == Mode.FLIGHT else parts
+    return nodes
+
+
+def _multiphase_params(
+    gaits: list[gait.Gait], config: RunConfig, robot: RobotParams
+) -> multiphase.MultiPhaseParams:
+    chosen, bound = config.multiphase, config.bound
+    return multiphase.MultiPhaseParams(
+        nodes=jnp.asarray(_cycle_nodes(gaits, config)),
+        state_weights=jnp.asarray(chosen.state_weights),
+        input_weight=jnp.asarray(chosen.input_weight),
+        mass=jnp.asarray(config.srb.mass),
+        inertia=jnp.asarray(config.srb.inertia * chosen.inertia_scale),
+        friction=jnp.asarray(chosen.friction),
+        torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
+        force_x_max=jnp.asarray(chosen.force_x_max),
+        force_z=jnp.asarray([chosen.force_z_min, chosen.force_z_max]),
+        feet=jnp.asarray([bound.feet_front, -bound.feet_rear]),
+        velocity_gain=jnp.asarray(bound.velocity_gain),
+        velocity_time=jnp.asarray(chosen.velocity_time),
+        height_time=jnp.asarray(chosen.height_time),
+    )
 
 
 def _reference_tables(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
@@ -452,28 +590,40 @@ def _piece(times: Float[Array, "K"], time: Float[Array, ""]) -> Int[Array, ""]:
 
 
 def _periodic_rows(
-    params: ControllerParams, clock: gait.Clock, elapsed: Float[Array, "k"]
+    params: ControllerParams,
+    clock: gait.Clock,
+    phase: Int[Array, "k"],
+    cycles: Int[Array, "k"],
+    place: Float[Array, "k"],
 ) -> Float[Array, "k 4"]:
-    """The gait's periodic motion at times since the phase began; it stops at the phase's end."""
+    """The gait's periodic motion in ``phase``, so many cycles on, ``place`` [s] after its start.
+
+    It stops at the phase's end.
+    """
     levels, samples = params.reference.shape[1], params.reference.shape[3]
-    table = params.reference[clock.gait, jnp.minimum(clock.cycle, levels - 1), clock.phase]
-    place = jnp.clip(elapsed / gait.phase_duration(params.schedule, clock), 0.0, 1.0)
-    place = place * (samples - 1)
-    low = jnp.minimum(place.astype(jnp.int32), samples - 2)
-    part = (place - low)[:, None]
-    return (1.0 - part) * table[low] + part * table[low + 1]
+    cycle = clock.cycle + cycles
+    level = jnp.minimum(cycle, levels - 1)
+    duration = jax.vmap(
+        lambda phase, cycle: gait.phase_duration(
+            params.schedule, clock._replace(phase=phase, cycle=cycle)
+        )
+    )(phase, cycle)
+    where = jnp.clip(place / duration, 0.0, 1.0) * (samples - 1)
+    low = jnp.minimum(where.astype(jnp.int32), samples - 2)
+    part = (where - low)[:, None]
+    at, after = (params.reference[clock.gait, level, phase, i] for i in (low, low + 1))
+    return (1.0 - part) * at + part * after
 
 
 def _contact_points(
     robot: RobotParams, body: PlanarState, stance: Bool[Array, "4"]
 ) -> Float[Array, "2 2"]:
-    """Mean contact point (x, z) of the stance feet at each end, body frame from the CoM [m].
+    """Mean contact point (x, z) of the stance feet at each end, world frame from the CoM [m].
 
     An end without a stance foot gets its swing feet, which no force acts on.
     """
     ground = body.feet - jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
-    local = (ground - body.x[:2]) @ body.rotation
-    ends = local.reshape(2, 2, 2)
-    weight = stance.reshape(2, 2).astype(local.dtype)
+    ends = (ground - body.x[:2]).reshape(2, 2, 2)
+    weight = stance.reshape(2, 2).astype(ends.dtype)
     weight = jnp.where(weight.sum(axis=1, keepdims=True) > 0, weight, 1.0)
     return (ends * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]

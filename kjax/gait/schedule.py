@@ -279,6 +279,63 @@ def time_to_touchdown(schedule: Schedule, clock: Clock) -> Float[Array, "4"]:
     return jnp.where(schedule.stance[where], 0.0, wait - clock.elapsed)
 
 
+class Preview(NamedTuple):
+    """The phases of one gait cycle from now on: P + 1 slots, unused ones of no duration.
+
+    Slot 0 is what is left of the present phase, the last one in use what has passed of it.
+
+    Attributes:
+      phase: (S,) index of the phase.
+      cycle: (S,) its cycle.
+      begin: (S,) time from now to the slot's start [s].
+      duration: (S,) of the slot [s].
+      fraction: (S,) of its phase that the slot holds [-].
+      passed: (S,) time between the phase's start and the slot's [s].
+    """
+
+    phase: Int[Array, "S"]
+    cycle: Int[Array, "S"]
+    begin: Float[Array, "S"]
+    duration: Float[Array, "S"]
+    fraction: Float[Array, "S"]
+    passed: Float[Array, "S"]
+
+
+def preview(schedule: Schedule, clock: Clock, shortest: float) -> Preview:
+    """Phases of one cycle of the present gait, from now to the same place in the next cycle.
+
+    Args:
+      schedule: of all gaits.
+      clock: now.
+      shortest: least time that is taken to be left of the present phase [s].
+    """
+    count = schedule.phases[clock.gait]
+    slot = jnp.arange(schedule.duration.shape[1] + 1)
+    steps = clock.phase + slot
+    wraps = steps >= count
+    seen = Clock(
+        gait=clock.gait,
+        phase=jnp.where(wraps, steps - count, steps) % count,
+        cycle=clock.cycle + wraps,
+        elapsed=jnp.zeros_like(slot, dtype=clock.elapsed.dtype),
+    )
+    full = jax.vmap(
+        lambda phase, cycle: phase_duration(
+            schedule, seen._replace(phase=phase, cycle=cycle, elapsed=clock.elapsed)
+        )
+    )(seen.phase, seen.cycle)
+    left = jnp.clip(full[0] - clock.elapsed, shortest, full[0])
+    duration = jnp.select([slot == 0, slot < count, slot == count], [left, full, full - left], 0.0)
+    return Preview(
+        phase=seen.phase,
+        cycle=seen.cycle,
+        begin=jnp.cumsum(duration) - duration,
+        duration=duration,
+        fraction=duration / full,
+        passed=jnp.where(slot == 0, full - left, 0.0),
+    )
+
+
 def advance(
     schedule: Schedule, clock: Clock, dt: float, wanted: Int[Array, ""] | None = None
 ) -> Clock:

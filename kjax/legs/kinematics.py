@@ -23,12 +23,12 @@ KNEE_RANGE = (-2.80, -0.90)  # rad; the Go1's -2.818 .. -0.888 with a small marg
 
 
 class LegTrig(NamedTuple):
-    """Sines and cosines of q1 and q1 + q2, (4,) each; shared by everything below."""
+    """Sines and cosines of q1 and q1 + q2, one of each per leg; shared by everything below."""
 
-    s1: Float[Array, "4"]
-    c1: Float[Array, "4"]
-    s12: Float[Array, "4"]
-    c12: Float[Array, "4"]
+    s1: Float[Array, "n"]
+    c1: Float[Array, "n"]
+    s12: Float[Array, "n"]
+    c12: Float[Array, "n"]
 
 
 def leg_trig(joint_pos: Float[Array, "4 3"]) -> LegTrig:
@@ -41,13 +41,13 @@ def leg_trig(joint_pos: Float[Array, "4 3"]) -> LegTrig:
     return jax.lax.optimization_barrier(trig)
 
 
-def foot_position(robot: RobotParams, trig: LegTrig) -> Float[Array, "4 2"]:
+def foot_position(robot: RobotParams, trig: LegTrig) -> Float[Array, "n 2"]:
     """Foot centre (x, z) relative to the thigh joint, trunk frame [m]."""
     l1, l2 = robot.thigh_length, robot.calf_length
     return jnp.stack([-l1 * trig.s1 - l2 * trig.s12, -l1 * trig.c1 - l2 * trig.c12], axis=-1)
 
 
-def foot_jacobian(robot: RobotParams, trig: LegTrig) -> Float[Array, "4 2 2"]:
+def foot_jacobian(robot: RobotParams, trig: LegTrig) -> Float[Array, "n 2 2"]:
     """Derivative of ``foot_position`` by (thigh, calf) angle, [leg, (x, z), joint] [m/rad]."""
     l1, l2 = robot.thigh_length, robot.calf_length
     calf_x, calf_z = -l2 * trig.c12, l2 * trig.s12
@@ -58,15 +58,15 @@ def foot_jacobian(robot: RobotParams, trig: LegTrig) -> Float[Array, "4 2 2"]:
 
 
 def inverse(
-    robot: RobotParams, foot: Float[Array, "4 2"]
-) -> tuple[Float[Array, "4"], Float[Array, "4"], LegTrig]:
+    robot: RobotParams, foot: Float[Array, "n 2"]
+) -> tuple[Float[Array, "n"], Float[Array, "n"], LegTrig]:
     """Thigh and calf angle that put the foot at ``foot``, knee back, and their trigonometry.
 
     A target out of reach is pulled to the nearest reachable one on the line from the hip.
 
     Args:
       robot: link lengths.
-      foot: (4, 2) target (x, z) relative to the thigh joint, trunk frame [m].
+      foot: (n, 2) target (x, z) relative to the thigh joint, trunk frame [m].
     """
     l1, l2 = robot.thigh_length, robot.calf_length
     low, high = REACH[0] * (l1 + l2), REACH[1] * (l1 + l2)

@@ -1,5 +1,6 @@
-"""Box-constrained quadratic programs; this package knows no robot."""
+"""Convex quadratic programs with a box, or with general rows; this package knows no robot."""
 
+from kjax.qp.interior import RowSolution, solve_rows
 from kjax.qp.problem import (
     STATUS_TEXT,
     Prepared,
@@ -10,4 +11,14 @@ from kjax.qp.problem import (
 )
 from kjax.qp.solvers import solve
 
-__all__ = ["STATUS_TEXT", "Prepared", "Solution", "Status", "kkt_residual", "prepare", "solve"]
+__all__ = [
+    "STATUS_TEXT",
+    "Prepared",
+    "RowSolution",
+    "Solution",
+    "Status",
+    "kkt_residual",
+    "prepare",
+    "solve",
+    "solve_rows",
+]

@@ -1,0 +1,265 @@
+"""The multi-phase LMPC against integrated rigid-body motion, C MuJoCo's leg and closed forms."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from kjax import gait
+from kjax.config import BoundConfig, RunConfig
+from kjax.controller import _cycle_nodes, _multiphase_params, build_gaits
+from kjax.mpc import multiphase
+from kjax.robots import go1
+from kjax.types import GRAVITY, Leg, Mode
+
+COUNT = 15
+BOUND = 1  # index of the gait
+FRONT, FIRST_FLIGHT, REAR, SECOND_FLIGHT = range(4)
+DURATION = (0.1, 0.1, 0.05, 0.1)  # s
+
+
+@pytest.fixture(scope="module")
+def config():
+    return RunConfig(bound=BoundConfig(horizon="multiphase", feet_front=0.05, feet_rear=0.1))
+
+
+@pytest.fixture(scope="module")
+def params(config):
+    return _multiphase_params(build_gaits(config), config, go1.PARAMS)
+
+
+@pytest.fixture(scope="module")
+def schedule(config):
+    return gait.build_schedule(build_gaits(config))
+
+
+def clock_at(phase, elapsed, cycle=10):
+    index = [jnp.asarray(i, jnp.int32) for i in (BOUND, phase, cycle)]
+    return gait.Clock(*index, elapsed=jnp.asarray(elapsed, float))
+
+
+def nodes_at(params, schedule, phase, elapsed, cycle=10):
+    clock = clock_at(phase, elapsed, cycle)
+    return multiphase.build_nodes(params, schedule, clock, COUNT, 0.0025)
+
+
+@pytest.fixture(scope="module")
+def outlook_of(params):
+    """Outlook for given nodes, state and command, on flat ground."""
+
+    def build(nodes, x, velocity=0.0, command=0.0, slew=2.0, contact=((0.05, 0.0), (-0.1, 0.0))):
+        return multiphase.predict(
+            params,
+            nodes,
+            x,
+            position=x[0],
+            velocity=jnp.asarray(velocity),
+            command=jnp.asarray(command),
+            slew=jnp.asarray(slew),
+            height=jnp.asarray(0.27),
+            ground=jnp.asarray(0.0),
+            periodic=jnp.zeros((COUNT, 4)),
+            contact=jnp.asarray(contact),
+            stance_time=jnp.asarray(DURATION)[nodes.phase],
+            cycle_time=jnp.asarray(0.35),
+        )
+
+    return build
+
+
+@pytest.mark.parametrize(
+    ("phase", "elapsed"),
+    [(FRONT, 0.0), (FRONT, 0.03), (FRONT, 0.099), (FIRST_FLIGHT, 0.05), (REAR, 0.013)],
+)
+def test_the_preview_holds_one_cycle_that_ends_where_it_began(schedule, phase, elapsed):
+    ahead = gait.preview(schedule, clock_at(phase, elapsed), 0.0)
+    np.testing.assert_allclose(ahead.duration.sum(), 0.35, atol=1e-12)
+    np.testing.assert_allclose(ahead.duration[0], DURATION[phase] - elapsed, atol=1e-12)
+    np.testing.assert_allclose(ahead.duration[-1], elapsed, atol=1e-12)
+    assert ahead.phase.tolist() == [(phase + k) % 4 for k in range(5)]
+    np.testing.assert_allclose(ahead.begin[1:], np.cumsum(ahead.duration)[:-1], atol=1e-12)
+
+
+def test_the_preview_of_a_ramp_takes_the_next_cycles_longer_flights(schedule):
+    # The flights are at 0.3 of their length in cycle 0 and grow by 0.07 per cycle.
+    ahead = gait.preview(schedule, clock_at(SECOND_FLIGHT, 0.01, cycle=0), 0.0)
+    np.testing.assert_allclose(ahead.duration[:4], [0.02, 0.1, 0.037, 0.05], atol=1e-12)
+    assert ahead.cycle.tolist() == [0, 1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("elapsed", [0.0, 0.0125, 0.03, 0.0999, 0.1024, -0.002])
+@pytest.mark.parametrize("phase", range(4))
+def test_nodes_tile_the_cycle_and_never_cross_a_phase(params, schedule, phase, elapsed):
+    if elapsed > DURATION[phase] + 0.0025:
+        elapsed = DURATION[phase] / 3
+    nodes = nodes_at(params, schedule, phase, elapsed)
+    used = np.asarray(nodes.length) > 0
+    begin, end = np.asarray(nodes.end - nodes.length)[used], np.asarray(nodes.end)[used]
+    np.testing.assert_allclose(begin, np.r_[0.0, end[:-1]], atol=1e-12)
+    np.testing.assert_allclose(end[-1], 0.35, atol=0.0026)
+    # Each node's middle, mapped to the cycle by hand, lies in the phase that it names.
+    starts = np.r_[0.0, np.cumsum(DURATION)]
+    place = (
+        starts[phase] + np.clip(elapsed, 0, DURATION[phase] - 0.0025) + 0.5 * (begin + end)
+    ) % 0.35
+    expected = np.searchsorted(starts, place, side="right") - 1
+    assert np.asarray(nodes.phase)[used].tolist() == expected.tolist()
+    assert np.asarray(nodes.length)[used & (nodes.feet > 0)].max() <= 0.0125 + 1e-9
+    standing = np.isin(expected, [FRONT, REAR])
+    np.testing.assert_array_equal(np.asarray(nodes.feet)[used], 2.0 * standing)
+    np.testing.assert_array_equal(
+        np.asarray(nodes.end_index)[used & (nodes.feet > 0)], (expected == REAR)[standing]
+    )
+    np.testing.assert_array_equal(np.asarray(nodes.feet)[~used], 0.0)
+
+
+def test_the_predicted_motion_is_the_rigid_bodys_under_the_same_moments(
+    params, schedule, outlook_of
+):
+    # Independent integration of the body with forces in the world frame, the moment arm of each
+    # node taken from the outlook's path: the linear response must be exact.
+    nodes = nodes_at(params, schedule, FRONT, 0.04)
+    x = jnp.array([0.3, 0.26, 0.1, 0.5, -0.3, 1.2])
+    outlook = outlook_of(nodes, x, velocity=0.4, contact=((0.36, 0.0), (0.2, 0.01)))
+    free, forced = multiphase.response(params, nodes, outlook, x)
+    force = np.random.default_rng(0).normal(size=(COUNT, 2)) * [40, 100]
+    states = np.asarray(free + jnp.einsum("kajf,jf->ka", forced, jnp.asarray(force)))
+
+    m, inertia = 12.743, 0.394 * 0.87
+    now = np.asarray(x)
+    for k in np.flatnonzero(np.asarray(nodes.length) > 0):
+        total = force[k] * float(nodes.feet[k])
+        r = np.asarray(outlook.foot[k] - outlook.path[k, :2])
+        alpha = (r[0] * total[1] - r[1] * total[0]) / inertia
+        a = np.r_[total / m - [0, GRAVITY], alpha]
+        solved = solve_ivp(
+            lambda t, s, a=a: np.r_[s[3:], a], (0, float(nodes.length[k])), now, rtol=1e-10
+        )
+        now = solved.y[:, -1]
+        np.testing.assert_allclose(states[k], now, atol=1e-8)
+
+
+@pytest.mark.parametrize("slew", [2.0, np.inf])
+def test_the_reference_follows_the_command_at_its_slew(params, schedule, outlook_of, slew):
+    nodes = nodes_at(params, schedule, FRONT, 0.0)
+    x = jnp.array([0.0, 0.27, 0.0, 0.1, 0.0, 0.0])
+    outlook = outlook_of(nodes, x, velocity=0.1, command=0.5, slew=slew)
+    t = np.asarray(nodes.end)
+    wanted = np.minimum(0.1 + slew * t, 0.5)
+    np.testing.assert_allclose(outlook.reference[:, 3], wanted, atol=1e-12)
+    # Its position is the integral of its velocity.
+    fine = np.linspace(0, t[-1], 20001)
+    path = np.r_[0, np.cumsum(np.minimum(0.1 + slew * fine[1:], 0.5)) * (fine[1] - fine[0])]
+    np.testing.assert_allclose(outlook.reference[:, 0], np.interp(t, fine, path), atol=2e-5)
+
+
+def test_feet_in_stance_are_where_they_were_measured_and_coming_ones_at_raiberts(
+    params, schedule, outlook_of
+):
+    nodes = nodes_at(params, schedule, FRONT, 0.05)
+    x = jnp.array([1.0, 0.27, 0.0, 0.6, 0.0, 0.0])
+    contact = ((1.07, 0.02), (0.9, 0.0))
+    outlook = outlook_of(nodes, x, velocity=0.6, command=0.6, contact=contact)
+    foot, phase, present = (np.asarray(a) for a in (outlook.foot, nodes.phase, nodes.present))
+    np.testing.assert_allclose(foot[present], [contact[0]] * present.sum())
+    # The rear touches down after 0.05 s of stance and 0.1 s of flight, 0.6 m/s all the while.
+    rear = foot[phase == REAR]
+    np.testing.assert_allclose(rear[:, 0], 1.0 + 0.15 * 0.6 - 0.1 + 0.5 * 0.05 * 0.6, atol=1e-9)
+    later = foot[(phase == FRONT) & ~present & (np.asarray(nodes.length) > 0)]
+    np.testing.assert_allclose(later[:, 0], 1.0 + 0.3 * 0.6 + 0.05 + 0.5 * 0.1 * 0.6, atol=1e-9)
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_torque_rows_are_c_mujocos_jacobian(params, schedule, outlook_of, planar_go1, end):
+    phase = REAR if end else FRONT
+    nodes = nodes_at(params, schedule, phase, 0.0)
+    x = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
+    outlook = outlook_of(nodes, x, contact=((0.15, 0.0), (-0.2, 0.0)))
+    lever = jnp.array([0.01, -0.02])
+    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, outlook, lever)
+    np.testing.assert_allclose(limit, [0, 0, 0.95 * 23.7, 0.95 * 35.55], rtol=1e-12)
+
+    # Put MuJoCo's trunk where node 0 expects it and turn the joints until the foot is there.
+    leg = Leg.RR if end else Leg.FR
+    px, pz, theta = np.asarray(outlook.path[0])
+    R = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    data = mujoco.MjData(planar_go1)
+    base = [px, pz] - R @ np.asarray(lever)
+    data.qpos[[0, 1, 2]] = base[0], base[1], -theta
+    joints = [planar_go1.joint(f"{leg.name}_{name}").qposadr[0] for name in ("thigh", "calf")]
+    dofs = [planar_go1.joint(f"{leg.name}_{name}").dofadr[0] for name in ("thigh", "calf")]
+    data.qpos[joints] = 0.8, -1.6
+    geom = planar_go1.geom(f"{leg.name}_foot").id
+    target = np.asarray(outlook.foot[0]) + np.array([0, go1.FOOT_RADIUS])
+    jacobian = np.zeros((3, planar_go1.nv))
+    for _ in range(60):
+        mujoco.mj_kinematics(planar_go1, data)
+        mujoco.mj_comPos(planar_go1, data)
+        point = data.geom_xpos[geom]
+        mujoco.mj_jac(planar_go1, data, jacobian, None, point, planar_go1.geom_bodyid[geom])
+        J = jacobian[[0, 2]][:, dofs]
+        miss = target - point[[0, 2]]
+        data.qpos[joints] += np.linalg.solve(J, np.clip(miss, -0.02, 0.02))
+    assert np.abs(miss).max() < 1e-9
+    np.testing.assert_allclose(rows[0, 2:], J.T, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def plan(params, schedule, outlook_of):
+    """A solved plan of a moving robot in front stance, with all that went in."""
+    nodes = nodes_at(params, schedule, FRONT, 0.02)
+    x = jnp.array([0.0, 0.262, -0.08, 0.3, -0.1, -0.3])
+    outlook = outlook_of(nodes, x, velocity=0.3, command=1.0)
+    lever = jnp.array([0.0, -0.018])
+
+    @jax.jit
+    def solve(params):
+        return multiphase.solve(
+            params, go1.PARAMS, nodes, outlook, x, lever, tolerance=1e-9, max_iterations=40
+        )
+
+    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, outlook, lever)
+    return solve, nodes, outlook, rows, limit
+
+
+def test_the_plan_keeps_to_friction_torque_and_box(params, plan):
+    solve, nodes, _, rows, limit = plan
+    solved = solve(params)
+    assert solved.status == 0
+    force = np.asarray(solved.force)
+    standing = np.asarray(nodes.feet) > 0
+    np.testing.assert_array_equal(force[~standing], 0.0)
+    assert (np.abs(force[:, 0]) <= 0.6 * force[:, 1] + 1e-4)[standing].all()
+    assert (force[standing, 1] >= 10.0 - 1e-4).all()
+    torque = np.einsum("krf,kf->kr", np.asarray(rows)[:, 2:], force)
+    assert (np.abs(torque) <= np.asarray(limit)[2:] + 1e-4).all()
+
+
+def test_the_plan_makes_use_of_the_flight_it_foresees(params, plan):
+    # To speed up, both stances push forwards, though the rear one comes after a flight.
+    solve, nodes, *_ = plan
+    force, feet = np.asarray(solve(params).force), np.asarray(nodes.feet * nodes.length)
+    rear = np.asarray(nodes.phase) == REAR
+    impulse = feet * force[:, 0]
+    assert impulse.sum() > 0.5
+    assert impulse[rear].sum() > 0.1
+    # And the vertical impulses carry the weight over the cycle within what pitch leaves free.
+    assert feet @ force[:, 1] == pytest.approx(12.743 * GRAVITY * 0.35, rel=0.15)
+
+
+def test_a_tighter_torque_limit_binds(params, plan):
+    solve, _, _, rows, _ = plan
+    tight = params._replace(torque_limit=0.6 * params.torque_limit)
+    torque = np.einsum("krf,kf->kr", np.asarray(rows)[:, 2:], np.asarray(solve(tight).force))
+    assert np.abs(torque[:, 1]).max() == pytest.approx(0.6 * 0.95 * 35.55, rel=1e-3)
+
+
+def test_only_a_bound_with_that_horizon_has_nodes(config):
+    gaits = build_gaits(config)
+    nodes = _cycle_nodes(gaits, config)
+    assert nodes[BOUND].tolist() == [8, 1, 4, 1]
+    assert nodes.sum() == nodes[BOUND].sum()
+    assert _cycle_nodes(gaits, RunConfig()).sum() == 0
+    assert [phase.mode for phase in gaits[BOUND].phases][1] == Mode.FLIGHT
