@@ -133,17 +133,3 @@ def test_a_config_that_needs_another_simulation_is_refused(config, simulation):
     with pytest.raises(ValueError, match="fixed_part"):
         simulate(simulation, dataclasses.replace(config, bound=dataclasses.replace(
             config.bound, apex=0.1)))  # fmt: skip
-
-
-@pytest.mark.slow
-def test_worker_processes_give_what_this_process_gives(config, tmp_path, monkeypatch, repository):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(repository / ".cache" / "jax"))
-    chosen = seeds(config, 2)
-    (tmp_path / "two").mkdir()
-    here = episodes.Store(tmp_path / "here.json", "code")
-    there = episodes.Store(tmp_path / "two" / "there.json", "code")
-    with episodes.open_runner(here) as run:
-        expected = run(chosen)
-    with episodes.open_runner(there, jobs=2) as run:
-        got = run(chosen)
-    assert without_times(got) == without_times(expected)
