@@ -188,14 +188,16 @@ def _begin_worker(counter: Any) -> None:
     cli.configure_jax(one_core=True, core=number)
 
 
+_KEPT = 4  # simulations that a process keeps
 _built: dict[RunConfig, Simulation] = {}
 
 
 def _episode(config: RunConfig, record: Record | None, path: Path) -> dict[str, Any]:
-    """Run one episode in a worker; the last simulation built is kept for the next."""
+    """Run one episode, in a simulation that is kept for those to come."""
     fixed = fixed_part(config)
     if fixed not in _built:
-        _built.clear()  # of a hundred terrains and requests, all share one
+        while len(_built) >= _KEPT:
+            del _built[next(iter(_built))]
         _built[fixed] = build_simulation(config)
     run = simulate(_built[fixed], config)
     if record is not None and not run.interrupted:
