@@ -22,7 +22,7 @@ from tqdm import tqdm
 from kjax import cli
 from kjax.config import RunConfig, to_dict
 from kjax.sim.episode import Trajectory, fixed_part, metrics
-from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
+from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
 
 # Called in the worker with each finished run and the file that belongs to it.
 Record = Callable[[Trajectory, Path], None]
@@ -110,11 +110,11 @@ def open_runner(store: Store, *, jobs: int = 1, record: Record | None = None) ->
         yield lambda configs, **more: _run(store, configs, _here, record, **more)
         return
     context = multiprocessing.get_context("spawn")  # JAX's threads do not survive a fork
-    pool = ProcessPoolExecutor(
-        jobs, context, initializer=_begin_worker, initargs=(context.Value("i", 0),)
-    )
+    workers, call = context.Value("i", 0), context.RawValue("i", 0)
+    pool = ProcessPoolExecutor(jobs, context, initializer=_begin_worker, initargs=(workers, call))
+    execute = partial(_in_pool, pool, call)
     try:
-        yield lambda configs, **more: _run(store, configs, partial(_in_pool, pool), record, **more)
+        yield lambda configs, **more: _run(store, configs, execute, record, **more)
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -167,39 +167,70 @@ def _here(tasks: list[Task]) -> Iterator[tuple[str, dict[str, Any]]]:
         yield key, result
 
 
-def _in_pool(pool: ProcessPoolExecutor, tasks: list[Task]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Run tasks in worker processes; what has not begun when the caller stops is called off."""
-    futures = {pool.submit(_episode, *task): key for key, task in tasks}
+def _in_pool(
+    pool: ProcessPoolExecutor, call: Any, tasks: list[Task]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Run tasks in worker processes; what is not done when the caller stops is given up.
+
+    ``call`` is a number that the workers see: once it has moved on, they drop what they do.
+    """
+    number = call.value
+    futures = {pool.submit(_episode_of_call, number, *task): key for key, task in tasks}
     try:
         for future in as_completed(futures):
-            if not future.result()["interrupted"]:
-                yield futures[future], future.result()
+            if future.result()["interrupted"]:  # Ctrl-C reaches workers too, and may come first
+                raise KeyboardInterrupt
+            yield futures[future], future.result()
     finally:
+        call.value += 1
         for future in futures:
             future.cancel()
 
 
-def _begin_worker(counter: Any) -> None:
+_call: Any = None  # in a worker: the number of the parent's present call
+
+
+def _begin_worker(workers: Any, call: Any) -> None:
     """Give a worker process a core of its own, and leave Ctrl-C to its parent."""
+    global _call
+    _call = call
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with counter.get_lock():
-        number = counter.value
-        counter.value += 1
+    with workers.get_lock():
+        number = workers.value
+        workers.value += 1
     cli.configure_jax(one_core=True, core=number)
+
+
+def _episode_of_call(
+    number: int, config: RunConfig, record: Record | None, path: Path
+) -> dict[str, Any]:
+    """Run an episode, in a worker, for as long as the parent wants it."""
+
+    def go_on(done: int = 0, total: int = 0, data: Any = None) -> None:
+        if _call.value != number:
+            raise KeyboardInterrupt
+
+    try:
+        go_on()
+        return _episode(config, record, path, go_on)
+    except KeyboardInterrupt:
+        return {"interrupted": True}
 
 
 _KEPT = 4  # simulations that a process keeps
 _built: dict[RunConfig, Simulation] = {}
 
 
-def _episode(config: RunConfig, record: Record | None, path: Path) -> dict[str, Any]:
+def _episode(
+    config: RunConfig, record: Record | None, path: Path, on_tick: OnTick | None = None
+) -> dict[str, Any]:
     """Run one episode, in a simulation that is kept for those to come."""
     fixed = fixed_part(config)
     if fixed not in _built:
         while len(_built) >= _KEPT:
             del _built[next(iter(_built))]
         _built[fixed] = build_simulation(config)
-    run = simulate(_built[fixed], config)
+    run = simulate(_built[fixed], config, on_tick=on_tick)
     if record is not None and not run.interrupted:
         path.parent.mkdir(parents=True, exist_ok=True)
         record(run, path)

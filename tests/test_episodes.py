@@ -49,7 +49,7 @@ def test_killed_and_resumed_equals_uninterrupted(config, tmp_path, monkeypatch):
     path = tmp_path / "episodes.json"
     real, started = episodes.simulate, []
 
-    def killed(simulation, config):
+    def killed(simulation, config, on_tick=None):
         if len(started) == 2:
             raise KeyboardInterrupt
         started.append(config.seed)
