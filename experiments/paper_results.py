@@ -125,7 +125,7 @@ EXPERIMENTS = (
         vary="terrain",
         figure="terrain",
         rows=(
-            Row(metric="crossed", label="terrains crossed [-]", paper="1 of 1", target=0.98),
+            Row(metric="crossed", label="terrains crossed", paper="1 of 1", target=0.98),
             Row(
                 metric="field_pitch_p95_deg",
                 label="pitch in the field, 95 % [deg]",
@@ -145,7 +145,7 @@ EXPERIMENTS = (
         vary="terrain",
         figure="terrain",
         rows=(
-            Row(metric="crossed", label="terrains crossed [-]", paper="1 of 1", target=0.97),
+            Row(metric="crossed", label="terrains crossed", paper="1 of 1", target=0.97),
             # The config ramps the command up at 0.5 m/s^2, which dominates the plain RMSE.
             Row(metric=RMSE, label="RMSE against the raw step [m/s]", target=0.09),
             Row(

@@ -2,7 +2,7 @@
 
 Leaves results.json, table.md, index.html and figures/ in the output folder. Every finished episode
 is kept there: the same command goes on after Ctrl-C, and does nothing when all is done. The whole
-takes about 20 minutes per base on two cores; experiments/paper_results.py says what is run.
+takes about 10 minutes on two quiet cores (planar); experiments/paper_results.py says what is run.
 """
 
 import json
@@ -207,7 +207,7 @@ def _table(experiments: dict[str, Any]) -> list[list[str]]:
                 met = {None: "", True: "yes", False: "no"}[row["met"]]
                 rows.append(
                     [experiment.title, base, row["label"], row["paper"], _target(row),
-                     _number(row["median"]) + (f" (of {count})" if whole else ""),
+                     _count(row, count) if whole else _number(row["median"]),
                      "" if whole else _number(row["worst"]), floor, met]
                 )  # fmt: skip
     return rows
@@ -220,6 +220,11 @@ def _target(row: dict[str, Any]) -> str:
         return "none"
     sign = ">=" if row["metric"] == "crossed" else "<="
     return f"{sign} {row['target']:g}" + (" (worst)" if row["target_of"] == "worst" else "")
+
+
+def _count(row: dict[str, Any], runs: int) -> str:
+    share = row["metric"] == "crossed"
+    return f"{round(row['median'] * runs) if share else row['median']} of {runs}"
 
 
 def _number(value: float | None) -> str:

@@ -135,7 +135,7 @@ def switch_figure(
                 median = np.nanmedian(np.array(rows)[:, known], axis=0)
                 axis.plot(grid[known], median, color=RED, lw=1.6)
             axis.axvline(0.0, color=DARK, lw=0.8)
-            axis.set_title(f"{title} (n = {len(runs)})", loc="left", fontsize=8)
+            axis.set_title(f"{title}\nn = {len(runs)}", loc="left", fontsize=8)
             axis.set_xlim(-_BEFORE, _AFTER)
             axis.set_xlabel("time since the switch [s]")
         axes[0, 0].set_ylabel("pitch [deg], nose up +")
@@ -165,7 +165,7 @@ def envelope_figure(axes_found: Mapping[str, Mapping[str, Any]], path: Path) -> 
             axis.set_ylim(len(rows) - 0.4, -0.6)
             axis.set_xlim(left=0.0)
             axis.set_xlabel(quantity)
-        fig.suptitle("dot: passed; bar: up to the first that failed; arrow: no failure found",
+        fig.suptitle("dot: passed; bar: up to the first that failed; triangle: the end of the search passed",
                      fontsize=8)  # fmt: skip
         _finish(fig, path)
 
@@ -176,11 +176,9 @@ def _bracket(axis: Axes, y: int, one: Mapping[str, Any]) -> None:
         axis.plot(one["easy"], y, "x", color=RED)
         axis.annotate("fails", (one["easy"], y), (6, -3), textcoords="offset points")
         return
-    if failed is None:
-        axis.plot(passed, y, ">", color=BLUE)
-    else:
+    if failed is not None:
         axis.plot([passed, failed], [y, y], color=GREY, lw=4, solid_capstyle="butt")
-    axis.plot(passed, y, "o", color=BLUE)
+    axis.plot(passed, y, "o" if failed is not None else ">", color=BLUE)
     axis.annotate(f"{passed:.3g}", (passed, y), (0, 5), textcoords="offset points", ha="center")
 
 
