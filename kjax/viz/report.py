@@ -165,7 +165,7 @@ def envelope_figure(axes_found: Mapping[str, Mapping[str, Any]], path: Path) -> 
             axis.set_ylim(len(rows) - 0.4, -0.6)
             axis.set_xlim(left=0.0)
             axis.set_xlabel(quantity)
-        fig.suptitle("dot: passed; bar: up to the first that failed; triangle: the end of the search passed",
+        fig.suptitle("dot: passed; bar: up to what failed; triangle: the end of the search passed",
                      fontsize=8)  # fmt: skip
         _finish(fig, path)
 
