@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup trot trot-long fit test test-fast check benchmark clean
+.PHONY: setup trot trot-long fit reproduce envelope test test-fast check benchmark clean
 
 setup: $(STAMP)
 
@@ -22,6 +22,12 @@ trot-long: setup  ## the same with a prediction of 0.2 s
 
 fit: setup  ## the fit study of the paper's Fig. 3
 	$(BIN)/python experiments/koopman_fit.py configs/koopman_fit.toml
+
+reproduce: setup  ## all of the paper's figures and numbers; goes on where it stopped
+	$(BIN)/python experiments/reproduce.py
+
+envelope: setup  ## limits of each gait by bisection over seeds; goes on where it stopped
+	$(BIN)/python experiments/envelope.py
 
 test: setup  ## everything
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile

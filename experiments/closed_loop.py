@@ -2,29 +2,30 @@
 
 Leaves metrics.json, config.toml, trajectory.npz, figure.png and, if asked for, video.mp4 in the
 output folder. Ctrl-C stops the run and writes what was simulated. With --seeds, runs that are
-already in the folder's seeds.json (same config, same revision) are not repeated.
+already in the folder's seeds.json (same config, same code) are not repeated.
 """
 
 import argparse
 import dataclasses
-import hashlib
-import json
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from kjax import cli
-from kjax.config import ConfigError, RunConfig, to_dict
+from kjax.config import ConfigError, RunConfig
+from kjax.episodes import Store, code_version, config_hash
 from kjax.sim.episode import Trajectory, metrics
 from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
+from kjax.sim.summary import summarise
 
 # What the table shows: metric, printed name, format.
 TABLE = (
     ("velocity_rmse_mps", "velocity RMSE [m/s]", ".4f"),
+    ("velocity_reference_rmse_mps", "RMSE of the slewed reference [m/s]", ".4f"),
+    ("velocity_late_rmse_mps", "RMSE 2 s after the last step [m/s]", ".4f"),
     ("pitch_max_deg", "pitch, largest [deg]", ".2f"),
     ("pitch_p95_deg", "pitch, 95 % [deg]", ".2f"),
     ("field_pitch_p95_deg", "pitch in the field, 95 % [deg]", ".2f"),
@@ -32,14 +33,16 @@ TABLE = (
     ("switch_pitch_max_deg", "pitch after it, largest [deg]", ".2f"),
     ("pitch_settle_s", "pitch settled after [s]", ".3f"),
     ("height_mean_m", "CoM height, mean [m]", ".3f"),
+    ("height_error_max_m", "CoM height, largest error [m]", ".3f"),
     ("foot_slip_m", "foot slip per stance [m]", ".4f"),
     ("torque_saturation_fraction", "time with a saturated joint [-]", ".4f"),
+    ("knee_saturation_fraction", "time with a saturated knee [-]", ".4f"),
+    ("body_contact_fraction", "time with knee or trunk on the ground [-]", ".4f"),
     ("qp_unsolved", "QPs not solved", ".0f"),
     ("plan_ms_median", "plan, median [ms]", ".3f"),
     ("act_ms_median", "act, median [ms]", ".3f"),
     ("realtime_factor", "real-time factor [-]", ".1f"),
 )
-LOWER_IS_WORSE = {"realtime_factor"}
 
 
 def main() -> None:
@@ -149,18 +152,11 @@ def run_seeds(
     Each seed is one of noise and, where there are obstacles, of their field as well.
     """
     path = folder / "seeds.json"
-    record = cli.provenance()
-    plain = {key: value for key, value in to_dict(config).items() if key != "seed"}
-    del plain["terrain"]["seed"]
-    label = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
-    label += "@" + record["git_revision"]
-    done: dict[str, Any] = {}
-    if path.exists():
-        old = json.loads(path.read_text(encoding="utf-8"))
-        if old.get("label") != label:
-            print(f"{path}: other config or revision; starting afresh")
-        else:
-            done = old["seeds"]
+    plain = dataclasses.replace(config, seed=0, terrain=dataclasses.replace(config.terrain, seed=0))
+    store = Store(path, f"{config_hash(plain)}@{code_version()}", section="seeds")
+    if store.outdated:
+        print(f"{path}: other config or code; starting afresh")
+    done = store.done
     first, first_config = None, config
     for seed in range(config.seed, config.seed + count):
         if str(seed) in done:
@@ -173,42 +169,25 @@ def run_seeds(
             return run, this
         if first is None:
             first, first_config = run, this
-        done[str(seed)] = metrics(run, this)
-        chosen = [done[k] for k in done]
-        cli.save_json(
-            path, {"label": label, "provenance": record, "seeds": done, **summary(chosen)}
-        )
+        result = metrics(run, this)
+        store.add(str(seed), result, **summarise([*done.values(), result]))
     results = [done[str(s)] for s in range(config.seed, config.seed + count)]
     print_table(results)
     return first, first_config
 
 
-def summary(results: list[dict[str, Any]]) -> dict[str, Any]:
-    """Median and worst of each metric over runs that did not fall, and the number of falls."""
-    upright = [r for r in results if not r["fell"]]
-    out: dict[str, Any] = {"runs": len(results), "falls": len(results) - len(upright)}
-    if any("crossed" in r for r in results):
-        out["crossed"] = sum(r.get("crossed", False) for r in results)
-    for key, _, _ in TABLE:
-        values = [r[key] for r in upright if r.get(key) is not None]
-        if values:
-            worst = min(values) if key in LOWER_IS_WORSE else max(values)
-            out[key] = {"median": float(np.median(values)), "worst": worst}
-    return out
-
-
 def print_table(results: list[dict[str, Any]]) -> None:
     """One column for a single run; median and worst for several."""
-    total = summary(results)
+    total = summarise(results)
     several = len(results) > 1
-    print(f"{'':34}{'median':>10}{'worst':>10}" if several else "")
+    print(f"{'':42}{'median':>10}{'worst':>10}" if several else "")
     for key, name, form in TABLE:
         if key in total:
             median, worst = (format(total[key][k], form) for k in ("median", "worst"))
-            print(f"{name:34}{median:>10}" + (f"{worst:>10}" if several else ""))
+            print(f"{name:42}{median:>10}" + (f"{worst:>10}" if several else ""))
     crossed = [result["crossed"] for result in results if "crossed" in result]
     if crossed:
-        print(f"{'crossed the field':34}{sum(crossed):>7}/{len(crossed)}")
+        print(f"{'crossed the field':42}{sum(crossed):>7}/{len(crossed)}")
     for result in results:
         if result["fell"]:
             print(f"FELL at {result['fall_time_s']:.2f} s")

@@ -5,6 +5,7 @@ rollout, and, in a scan of the sampling ranges, the largest range for which each
 within the tolerance. Leaves metrics.json, config.toml and figure.png in the output folder.
 """
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -28,6 +29,29 @@ def main() -> None:
     config, args = cli.parse(FitStudyConfig, parser)
     cli.configure_jax()
     folder = cli.output_folder(args, "koopman_fit")
+    try:
+        result, curves = fit_study(config)
+    except ValueError as error:
+        cli.fail(str(error))
+    _print(config, result)
+
+    save_figure(config, curves, folder / "figure.png")
+    cli.save_json(folder / "metrics.json", result)
+    cli.save_config(folder / "config.toml", config)
+    print(f"\nresults in {folder}/")
+
+
+def fit_study(config: FitStudyConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Fit on the config's ranges and test; then again on each of its smaller ranges.
+
+    Returns:
+      ``fit`` per mode, ``error_at_end`` per mode, statistic and state, and
+      ``largest_scale_within_tolerance`` per mode and statistic; and per mode the statistics over
+      time, each (steps, 6).
+
+    Raises:
+      ValueError: if the fit is not finite.
+    """
     koopman, data = config.koopman, config.koopman.dataset
     dictionary, body = build_dictionary(koopman), srb_params(config.srb)
     steps = round(config.test_duration / data.dt)
@@ -63,53 +87,62 @@ def main() -> None:
     key = jax.random.key(data.seed)
     report, statistics = jax.device_get(study(key, jnp.asarray(1.0)))
     if not report.finite.all():
-        cli.fail("the fit is not finite: check srb and koopman.dataset ranges")
+        raise ValueError("the fit is not finite: check srb and koopman.dataset ranges")
     result: dict[str, Any] = {"fit": {}, "error_at_end": {}, "largest_scale_within_tolerance": {}}
-    print(f"dictionary '{koopman.dictionary}', p = {koopman.order}: {dictionary.size} observables")
     for mode in MODES.values():
-        fit = {
+        result["fit"][mode.name.lower()] = {
             "rank": int(report.rank[mode]),
             "columns": int(report.columns[mode]),
             "condition": float(report.condition[mode]),
             "condition_full": float(report.condition_full[mode]),
             "one_step_residual_rms": report.residual_rms[mode],
         }
-        result["fit"][mode.name.lower()] = fit
-        print(
-            f"  {mode.name.lower():6} rank {fit['rank']} of {fit['columns']}, condition of the "
-            f"scaled regressor {fit['condition']:.1e} (all columns: {fit['condition_full']:.1e})"
-        )
-
-    curves = {}
-    print(f"\nprediction error after {1e3 * config.test_duration:g} ms, "
-          f"{config.test_states} x {config.test_profiles} rollouts")  # fmt: skip
-    for i, name in enumerate(MODES):
-        here = {key: getattr(statistics, key)[i] for key in STATISTICS}
-        curves[name] = here
+    curves = {
+        name: {key: getattr(statistics, key)[i] for key in STATISTICS}
+        for i, name in enumerate(MODES)
+    }
+    scan = {s: jax.device_get(study(key, jnp.asarray(s)))[1] for s in sorted(config.scales)}
+    for i, (name, here) in enumerate(curves.items()):
         result["error_at_end"][name] = {
             key: dict(zip(STATE_NAMES, values[-1], strict=True)) for key, values in here.items()
         }
-        print(f"  {name:10}" + "".join(f"{key:>12}" for key in STATISTICS))
-        for state, (label, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True)):
-            values = "".join(f"{here[key][-1, state]:12.1e}" for key in STATISTICS)
-            print(f"    {label:5} {unit:6}{values[2:]}")
+        result["largest_scale_within_tolerance"][name] = {
+            key: _largest_scale(scan, key, i, config.tolerance) for key in STATISTICS
+        }
+    return result, curves
 
+
+def save_figure(config: FitStudyConfig, curves: dict[str, Any], path: Path) -> None:
+    """Draw the statistics over time that ``fit_study`` returned."""
+    from kjax.viz.plots import fit_figure
+
+    steps = len(next(iter(curves.values()))["mean"])
+    time = config.koopman.dataset.dt * np.arange(1, steps + 1)
+    fit_figure(curves, time, path, STATE_NAMES)
+
+
+def _print(config: FitStudyConfig, result: dict[str, Any]) -> None:
+    koopman = config.koopman
+    print(f"dictionary '{koopman.dictionary}', p = {koopman.order}: "
+          f"{build_dictionary(koopman).size} observables")  # fmt: skip
+    for name, fit in result["fit"].items():
+        print(
+            f"  {name:6} rank {fit['rank']} of {fit['columns']}, condition of the "
+            f"scaled regressor {fit['condition']:.1e} (all columns: {fit['condition_full']:.1e})"
+        )
+    print(f"\nprediction error after {1e3 * config.test_duration:g} ms, "
+          f"{config.test_states} x {config.test_profiles} rollouts")  # fmt: skip
+    for name, here in result["error_at_end"].items():
+        print(f"  {name:10}" + "".join(f"{key:>12}" for key in STATISTICS))
+        for label, unit in zip(STATE_NAMES, STATE_UNITS, strict=True):
+            values = "".join(f"{here[key][label]:12.1e}" for key in STATISTICS)
+            print(f"    {label:5} {unit:6}{values[2:]}")
     print(f"\nlargest fraction of those ranges for which the statistic stays within "
           f"{config.tolerance:g} in all six states")  # fmt: skip
     print("  " + " " * 10 + "".join(f"{key:>12}" for key in STATISTICS))
-    scan = {s: jax.device_get(study(key, jnp.asarray(s)))[1] for s in sorted(config.scales)}
-    for i, name in enumerate(MODES):
-        best = {key: _largest_scale(scan, key, i, config.tolerance) for key in STATISTICS}
-        result["largest_scale_within_tolerance"][name] = best
+    for name, best in result["largest_scale_within_tolerance"].items():
         shown = "".join(f"{'none' if v is None else format(v, 'g'):>12}" for v in best.values())
         print(f"  {name:10}{shown}")
-
-    from kjax.viz.plots import fit_figure
-
-    fit_figure(curves, data.dt * np.arange(1, steps + 1), folder / "figure.png", STATE_NAMES)
-    cli.save_json(folder / "metrics.json", result)
-    cli.save_config(folder / "config.toml", config)
-    print(f"\nresults in {folder}/")
 
 
 def _largest_scale(

@@ -52,6 +52,14 @@ def run(main: Callable[[], None]) -> None:
         fail(f"{error.filename or 'output'}: {error.strerror or error}")
 
 
+def script_parser(description: str) -> argparse.ArgumentParser:
+    """Parser with ``--out`` for a script that takes no config; its errors are one line too."""
+    parser = _Parser(description=description, allow_abbrev=False)
+    parser.add_argument("--out", type=Path, help="output folder")
+    parser.set_defaults(config=None)
+    return parser
+
+
 def build_parser(cls: type, description: str) -> argparse.ArgumentParser:
     """Parser with the config file, ``--out`` and one option per config key."""
     parser = _Parser(
@@ -125,16 +133,18 @@ def _type_name(annotation: Any) -> str:
     return getattr(annotation, "__name__", "VALUE").upper()
 
 
-def configure_jax(*, one_core: bool = False) -> None:
+def configure_jax(*, one_core: bool = False, core: int | None = None) -> None:
     """JAX as the experiments want it: float64, compile cache on disk, synchronous dispatch.
 
     Args:
       one_core: bind the process to one core. A single robot's controller is many small kernels,
         which waking a second thread only delays.
+      core: which of the cores that the process may use, counted round; by the process id if None.
     """
     if one_core and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[os.getpid() % len(cores)]})
+        number = os.getpid() if core is None else core
+        os.sched_setaffinity(0, {cores[number % len(cores)]})
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

@@ -363,6 +363,31 @@ class TerrainConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
+class PushConfig:
+    """Pushes on the trunk, at its centre of mass, in the world frame."""
+
+    times: tuple[NonNegative, ...] = ()
+    """When each push begins; none by default [s]."""
+    forward: float | tuple[float, ...] = 0.0
+    """Impulse along x, of every push or of each [N s]."""
+    lateral: float | tuple[float, ...] = 0.0
+    """Impulse along y, to the left; the free base only [N s]."""
+    duration: Positive = 0.1
+    """Time over which an impulse is spread evenly [s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "PushConfig":
+        for name in ("forward", "lateral"):
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) != len(self.times):
+                raise ValueError(
+                    f"{name} must be one number or as many as times, got {len(value)} and "
+                    f"{len(self.times)}"
+                )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class NoiseConfig:
     """Sensor noise (white, each physics step) and spread of the initial state; 1 sigma each."""
 
@@ -438,6 +463,8 @@ class RunConfig:
     """Physics."""
     terrain: TerrainConfig = TerrainConfig()
     """Terrain."""
+    push: PushConfig = PushConfig()
+    """Pushes."""
     noise: NoiseConfig = NoiseConfig()
     """Noise."""
 
@@ -447,6 +474,10 @@ class RunConfig:
         _require_multiple(
             "lmpc.model_dt", self.lmpc.model_dt, "koopman.dataset.dt", self.koopman.dataset.dt
         )
+        _require_multiple("push.duration", self.push.duration, "sim.sim_dt", self.sim.sim_dt)
+        lateral = self.push.lateral
+        if self.sim.base == "planar" and any(lateral if isinstance(lateral, tuple) else [lateral]):
+            raise ValueError(f"push.lateral needs sim.base = 'free', got {lateral} and 'planar'")
         bound = self.bound
         shortest = {
             "gait.stance_time": self.gait.stance_time,

@@ -1,6 +1,6 @@
 """What an episode starts from and what it leaves: initial state, noise, trajectory, metrics."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from kjax import qp
-from kjax.config import RunConfig
+from kjax.config import CommandConfig, NoiseConfig, PushConfig, RunConfig, TerrainConfig
+from kjax.controller import build_gaits
 from kjax.legs.kinematics import planar_state
 from kjax.robots import go1
 from kjax.sim.observe import NOISE_DIM, Observe, noise_scale
@@ -17,6 +18,7 @@ from kjax.sim.observe import NOISE_DIM, Observe, noise_scale
 FALL_HEIGHT = 0.12  # m, centre of mass; about the trunk lying on the ground
 FALL_PITCH = 1.0  # rad
 SETTLE_TIME = 0.5  # s; metrics leave out the start from standing
+LATE_TIME = 2.0  # s after the last change of command, for what should be steady by then
 
 
 @dataclass(kw_only=True)
@@ -35,6 +37,8 @@ class Trajectory:
       stance: (N, 4) scheduled stance.
       force: (N, 4, 2) planned force on each leg, body frame [N].
       velocity_command: (N,) [m/s].
+      velocity_reference: (N,) what the LMPC tracks: the command at a bounded rate [m/s].
+      body_contact: (P,) whether anything but a foot touches the world at a control tick.
       plan_status: (P,) ``qp.Status`` of each plan.
       plan_residual: (P,) KKT residual [-].
       plan_iterations: (P,) solver iterations.
@@ -56,6 +60,8 @@ class Trajectory:
     stance: np.ndarray
     force: np.ndarray
     velocity_command: np.ndarray
+    velocity_reference: np.ndarray
+    body_contact: np.ndarray
     plan_status: np.ndarray
     plan_residual: np.ndarray
     plan_iterations: np.ndarray
@@ -77,6 +83,27 @@ class Trajectory:
         for name, kind in (("wall_time", float), ("fell", bool), ("interrupted", bool)):
             values[name] = kind(values[name])
         return cls(**values)
+
+
+def fixed_part(config: RunConfig) -> RunConfig:
+    """The config without what may differ between the episodes of one compiled simulation.
+
+    That is the seed, duration, noise, pushes, times and speeds of the command, times of the gaits,
+    friction, and the terrain's seed and sizes. Configs with the same fixed part share a
+    ``mujoco_loop.Simulation``.
+    """
+    pieces = tuple(map(float, range(len(config.command.times))))
+    return replace(
+        config,
+        seed=0,
+        duration=1.0,
+        noise=NoiseConfig(),
+        push=PushConfig(),
+        command=CommandConfig(times=pieces, velocities=pieces),
+        gait=replace(config.gait, times=tuple(map(float, range(len(config.gait.times))))),
+        sim=replace(config.sim, friction=1.0),
+        terrain=TerrainConfig(kind=config.terrain.kind, count=config.terrain.count),
+    )
 
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,6 +178,7 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
     height = run.x[steady, 1]
     limit = go1.PARAMS.torque_limit
     saturated = np.abs(run.torque) >= 0.999 * limit
+    joints = saturated.any(axis=1).mean(axis=0)
     unsolved = run.plan_status != qp.Status.SOLVED
     result |= {
         "velocity_rmse_mps": float(np.sqrt(np.mean(error**2))),
@@ -160,11 +188,19 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         "height_min_m": float(height.min()),
         "height_max_m": float(height.max()),
         "distance_m": float(run.x[-1, 0] - run.x[0, 0]),
+        **_tracking(run, config),
         **_crossing(run, config),
         **_switching(run, config),
         "foot_slip_m": foot_slip(run, config.sim.sim_dt, config.sim.contact_threshold),
         "torque_max_nm": float(np.abs(run.torque).max()),
         "torque_saturation_fraction": float(saturated.any(axis=(1, 2)).mean()),
+        **{
+            f"{name}_saturation_fraction": float(value)
+            for name, value in zip(("abduction", "thigh", "knee"), joints, strict=True)
+        },
+        "body_contact_fraction": (
+            float(run.body_contact.mean()) if config.sim.contacts == "all" else None
+        ),
         "qp_unsolved": int(unsolved.sum()),
         "qp_iterations_median": float(np.median(run.plan_iterations)),
         "plan_ms_median": float(1e3 * np.median(run.plan_time)),
@@ -173,6 +209,33 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         "act_ms_p99": float(1e3 * np.percentile(run.act_time, 99)),
         "realtime_factor": float(len(run.time) * config.sim.sim_dt / run.wall_time),
     }
+    return result
+
+
+def _tracking(run: Trajectory, config: RunConfig) -> dict[str, Any]:
+    """Speed against what the LMPC is given and late in the run; height against the configured one.
+
+    The height is that of the gait in use (for a bound its mean in stance), on flat ground only.
+    """
+    steady = run.time >= SETTLE_TIME
+    against = run.x[steady, 3] - run.velocity_reference[steady]
+    result: dict[str, Any] = {
+        "velocity_reference_rmse_mps": float(np.sqrt(np.mean(against**2))),
+    }
+    late = run.time >= max(SETTLE_TIME, config.command.times[-1] + LATE_TIME)
+    if late.any():
+        error = run.x[late, 3] - run.velocity_command[late]
+        result |= {
+            "velocity_late_mean_mps": float(run.x[late, 3].mean()),
+            "velocity_late_rmse_mps": float(np.sqrt(np.mean(error**2))),
+        }
+    if config.terrain.kind == "flat":
+        bounding = run.gait[steady] == [g.name for g in build_gaits(config)].index("bound")
+        error = run.x[steady, 1] - np.where(bounding, config.bound.height, config.lmpc.height)
+        result |= {
+            "height_error_max_m": float(np.abs(error).max()),
+            "height_error_mean_m": float(error.mean()),
+        }
     return result
 
 

@@ -16,6 +16,7 @@ from mujoco import mjx
 from kjax.config import RunConfig
 from kjax.controller import Controller, ControllerParams, ControllerState, PlanInfo
 from kjax.sim.observe import add_noise, build_observe, resolve
+from kjax.sim.push import push_force, pushed_body
 from kjax.sim.scene import build_spec
 
 
@@ -70,6 +71,7 @@ def build_mjx(config: RunConfig, controller: Controller) -> MjxSimulation:
     mjx_model = mjx.put_model(model)
     observe = build_observe(model, config.sim.contact_threshold)
     actuators = resolve(model).actuator.reshape(-1)
+    pushed = pushed_body(model)
 
     def reset(qpos: Array, qvel: Array) -> Any:
         data = mjx.make_data(mjx_model)
@@ -87,7 +89,9 @@ def build_mjx(config: RunConfig, controller: Controller) -> MjxSimulation:
             state, data = carry
             state, torque = controller.act(params, state, sense(data, noise))
             ctrl = jnp.zeros_like(data.ctrl).at[actuators].set(torque.reshape(-1))
-            moved = mjx.step(mjx_model, data.replace(ctrl=ctrl))
+            force = push_force(config.push, data.time, config.sim.sim_dt)
+            pushes = jnp.zeros_like(data.xfrc_applied).at[pushed, :3].set(force)
+            moved = mjx.step(mjx_model, data.replace(ctrl=ctrl, xfrc_applied=pushes))
             return (state, _same_types(moved, data)), (data.qpos, data.qvel, torque)
 
         def tick(carry: Any, noise: Array) -> Any:

@@ -24,10 +24,18 @@ from kjax.controller import (
 )
 from kjax.robots import go1
 from kjax.sim import terrain
-from kjax.sim.episode import Trajectory, fallen, initial_state, sagittal, sensor_noise
+from kjax.sim.episode import (
+    Trajectory,
+    fallen,
+    fixed_part,
+    initial_state,
+    sagittal,
+    sensor_noise,
+)
 from kjax.sim.observe import NOISE_DIM, Addresses, Observe, add_noise, build_observe, resolve
+from kjax.sim.push import push_force, pushed_body
 from kjax.sim.scene import build_model
-from kjax.types import Observation
+from kjax.types import Command, Leg, Observation
 
 # Called once per control tick with the steps done, the steps in all and the data; return value
 # ignored. For progress bars and viewers.
@@ -44,17 +52,48 @@ class TickLog(NamedTuple):
     stance: Any
     force: Any
     velocity_command: Any
+    velocity_reference: Any
     status: Any
     residual: Any
     iterations: Any
 
 
+class Requests(NamedTuple):
+    """What is asked of the controller in one episode; data, so that no episode recompiles.
+
+    Attributes:
+      gait_times: (K,) when each gait is asked for [s].
+      command: forward velocity over time.
+    """
+
+    gait_times: Any
+    command: Command
+
+
+class LoopState(NamedTuple):
+    """What is carried from call to call."""
+
+    controller: ControllerState
+    requests: Requests
+
+
+def requests(config: RunConfig) -> Requests:
+    """What a config asks of the controller."""
+    return Requests(
+        gait_times=np.asarray(config.gait.times),
+        command=Command(
+            times=np.asarray(config.command.times),  # type: ignore[arg-type]
+            velocities=np.asarray(config.command.velocities),  # type: ignore[arg-type]
+        ),
+    )
+
+
 class Simulation(NamedTuple):
-    """Everything compiled and built for one config; reusable over seeds.
+    """Everything compiled and built for one config, and for all with the same ``fixed_part``.
 
     The jitted calls take one flat vector of sensor values (qpos, qvel, sensordata, noise) and keep
-    the controller state in another: passing pytrees costs 2 us per leaf and call, more than the
-    controller itself.
+    the controller state and the episode's requests in another: passing pytrees costs 2 us per leaf
+    and call, more than the controller itself.
 
     Attributes:
       config: it was built from.
@@ -63,7 +102,7 @@ class Simulation(NamedTuple):
       observe: (qpos, qvel, sensordata) -> observation.
       controller: pure functions.
       params: controller numbers.
-      init: jitted (sensed,) -> state.
+      init: jitted (sensed, requests) -> state; without requests, those of the config.
       plan: jitted (state, sensed) -> (state, log).
       act: jitted (state, sensed) -> (state, torque (12,) in leg order).
       unpack_log: log vectors (P, n) -> ``TickLog`` of arrays with a leading axis P.
@@ -75,7 +114,7 @@ class Simulation(NamedTuple):
     observe: Observe
     controller: Controller
     params: ControllerParams
-    init: Callable[[ArrayLike], Array]
+    init: Callable[..., Array]
     plan: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
     act: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
     unpack_log: Callable[[np.ndarray], TickLog]
@@ -98,7 +137,7 @@ def build_simulation(config: RunConfig) -> Simulation:
         qpos, qvel, sensordata, noise = jnp.split(sensed, cuts)
         return add_noise(observe(qpos, qvel, sensordata), noise)
 
-    def pack(tree: ControllerState | TickLog) -> Array:
+    def pack(tree: LoopState | TickLog) -> Array:
         return jnp.concatenate([jnp.ravel(a).astype(dtype) for a in jax.tree.leaves(tree)])
 
     def unpack(flat: Array, like: Any) -> Any:
@@ -112,33 +151,44 @@ def build_simulation(config: RunConfig) -> Simulation:
             ],
         )
 
-    def plan_log(state: ControllerState, sensed: Array) -> tuple[ControllerState, TickLog]:
-        state, info = controller.plan(params, state, sense(sensed))
+    def asked(requests: Requests) -> ControllerParams:
+        return params._replace(gait_times=requests.gait_times, command=requests.command)
+
+    def begin(sensed: Array, wanted: Requests) -> LoopState:
+        wanted = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), wanted)
+        return LoopState(controller.init(asked(wanted), sense(sensed)), wanted)
+
+    def plan_log(loop: LoopState, sensed: Array) -> tuple[LoopState, TickLog]:
+        state, info = controller.plan(asked(loop.requests), loop.controller, sense(sensed))
         log = TickLog(
             gait=state.clock.gait,
             stance=state.stance,
             force=state.force,
             velocity_command=state.velocity_command,
+            velocity_reference=state.velocity,
             status=info.status,
             residual=info.residual,
             iterations=info.iterations,
         )
-        return state, log
+        return loop._replace(controller=state), log
 
-    def init(sensed: Array) -> Array:
-        return pack(controller.init(params, sense(sensed)))
+    def init(sensed: Array, wanted: Requests) -> Array:
+        return pack(begin(sensed, wanted))
 
     def plan(flat: Array, sensed: Array) -> tuple[Array, Array]:
         state, log = plan_log(unpack(flat, state_like), sensed)
         return pack(state), pack(log)
 
     def act(flat: Array, sensed: Array) -> tuple[Array, Array]:
-        state, torque = controller.act(params, unpack(flat, state_like), sense(sensed))
-        return pack(state), torque.reshape(-1)
+        loop = unpack(flat, state_like)
+        state, torque = controller.act(asked(loop.requests), loop.controller, sense(sensed))
+        return pack(loop._replace(controller=state)), torque.reshape(-1)
 
     dtype = params.position_slack.dtype
     example = jax.ShapeDtypeStruct((cuts[-1] + NOISE_DIM,), dtype)
-    state_like = jax.eval_shape(lambda sensed: controller.init(params, sense(sensed)), example)
+    default = requests(config)
+    state_like = jax.eval_shape(begin, example, default)
+    jitted_init = jax.jit(init)
     _, log_like = jax.eval_shape(plan_log, state_like, example)
     simulation = Simulation(
         config=config,
@@ -147,7 +197,7 @@ def build_simulation(config: RunConfig) -> Simulation:
         observe=observe,
         controller=controller,
         params=params,
-        init=jax.jit(init),
+        init=lambda sensed, wanted=default: jitted_init(sensed, wanted),
         plan=jax.jit(plan),
         act=jax.jit(act),
         unpack_log=lambda flat: jax.device_get(jax.vmap(lambda one: unpack(one, log_like))(flat)),
@@ -188,6 +238,7 @@ def _until_ctrl_c(ticks: Iterable[int]) -> Iterator[int]:
 
 def simulate(
     simulation: Simulation,
+    config: RunConfig | None = None,
     *,
     seed: int | None = None,
     terrain_seed: int | None = None,
@@ -197,11 +248,17 @@ def simulate(
 
     Args:
       simulation: from ``build_simulation``.
+      config: of the episode, in place of the one that the simulation was built from.
       seed: of noise and initial state, in place of the config's.
       terrain_seed: of the obstacles, in place of the config's; moves those of the model.
       on_tick: called once per control tick.
+
+    Raises:
+      ValueError: for a config that needs another simulation.
     """
-    config = simulation.config
+    config = simulation.config if config is None else config
+    if fixed_part(config) != fixed_part(simulation.config):
+        raise ValueError("the simulation was built from a config with another episode.fixed_part")
     if seed is not None:
         config = dataclasses.replace(config, seed=seed)
     model, at = simulation.model, simulation.addresses
@@ -209,6 +266,8 @@ def simulate(
     if terrain_seed is not None:
         field = dataclasses.replace(field, seed=terrain_seed)
     terrain.place(model, terrain.generate(field, config.sim.friction))
+    soles = [model.geom(f"{leg.name}_foot").id for leg in Leg]
+    model.geom_friction[soles, 0] = config.sim.friction
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
     mujoco.mj_forward(model, data)
@@ -232,10 +291,15 @@ def simulate(
     qpos, qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
     torque, foot_force = np.zeros((steps, 12)), np.zeros((steps, 4))
     plan_time, act_time = np.zeros(ticks), np.zeros(steps)
+    body_contact = np.zeros(ticks, bool)
+    is_foot_or_world = model.geom_bodyid == 0
+    is_foot_or_world[soles] = True
+    pushed = pushed_body(model)
+    push = push_force(config.push, np.arange(steps) * config.sim.sim_dt, config.sim.sim_dt, np)
     logs: list[np.ndarray] = []
     actuators, trunk = at.actuator.reshape(-1), model.body("trunk").id
 
-    state = simulation.init(sense(0))
+    state = simulation.init(sense(0), requests(config))
 
     fell = interrupted = False
     done = 0
@@ -258,8 +322,10 @@ def simulate(
                 torque[i] = command
                 act_time[i] = time.perf_counter() - clock
                 data.ctrl[actuators] = torque[i]
+                data.xfrc_applied[pushed, :3] = push[i]
                 mujoco.mj_step(model, data)
                 done = i + 1
+            body_contact[tick] = not is_foot_or_world[data.contact.geom].all()
             if fallen(data.subtree_com[trunk, 2], data.qpos[2]):
                 fell = True
                 break
@@ -287,6 +353,8 @@ def simulate(
         stance=ticks_log.stance[held],
         force=ticks_log.force[held],
         velocity_command=ticks_log.velocity_command[held],
+        velocity_reference=ticks_log.velocity_reference[held],
+        body_contact=body_contact[: len(ticks_log.status)],
         plan_status=ticks_log.status,
         plan_residual=ticks_log.residual,
         plan_iterations=ticks_log.iterations,

@@ -13,11 +13,12 @@ from matplotlib.axes import Axes
 from kjax.config import RunConfig
 from kjax.robots.go1 import JOINTS
 from kjax.sim.episode import Trajectory
+from kjax.sim.series import Series
 from kjax.types import Leg
 
-_BLUE, _RED, _GREY, _DARK = "#2b6cb0", "#c53030", "#a0aec0", "#2d3748"
+BLUE, RED, GREY, DARK = "#2b6cb0", "#c53030", "#a0aec0", "#2d3748"
 _LEG_COLOURS = ("#c53030", "#2b6cb0", "#dd6b20", "#2f855a")
-_STYLE = {
+STYLE = {
     "font.size": 8,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -38,25 +39,25 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
       path: image file to write.
       title: shown on top.
     """
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         fig, axes = plt.subplots(
             6, 1, figsize=(7.2, 9.0), height_ratios=[2.2, 1.3, 1.1, 1.4, 1.4, 1.3]
         )
         t = run.time
         velocity, pitch, height, force, torque, bars = axes
         window = max(1, round(2 * config.gait.stance_time / config.sim.sim_dt))
-        velocity.plot(t, run.x[:, 3], color=_GREY, lw=0.6, label="centre of mass")
-        velocity.plot(t, moving_mean(run.x[:, 3], window), color=_BLUE, label="mean over a stride")
-        velocity.plot(t, run.velocity_command, "--", color=_DARK, lw=1.1, label="command")
+        velocity.plot(t, run.x[:, 3], color=GREY, lw=0.6, label="centre of mass")
+        velocity.plot(t, moving_mean(run.x[:, 3], window), color=BLUE, label="mean over a stride")
+        velocity.plot(t, run.velocity_command, "--", color=DARK, lw=1.1, label="command")
         velocity.set_ylabel("v_x [m/s]")
         velocity.legend(ncol=3, loc="upper left")
         velocity.set_title(title, loc="left", fontsize=9)
 
-        pitch.plot(t, np.degrees(run.x[:, 2]), color=_BLUE)
+        pitch.plot(t, np.degrees(run.x[:, 2]), color=BLUE)
         pitch.set_ylabel("pitch [deg]\nnose up +")
 
-        height.plot(t, run.x[:, 1], color=_BLUE)
-        height.axhline(config.lmpc.height, ls="--", color=_DARK, lw=0.9)
+        height.plot(t, run.x[:, 1], color=BLUE)
+        height.axhline(config.lmpc.height, ls="--", color=DARK, lw=0.9)
         height.set_ylabel("CoM height [m]")
 
         for axis in (velocity, pitch, height):
@@ -69,7 +70,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         _forces(force, run, part)
         for joint, name in enumerate(JOINTS):
             peak = np.abs(run.torque[part, :, joint]).max(axis=1)
-            torque.plot(t[part], peak, color=(_GREY, _BLUE, _RED)[joint], label=name)
+            torque.plot(t[part], peak, color=(GREY, BLUE, RED)[joint], label=name)
         torque.set_ylabel("largest |torque|\nof the legs [N m]")
         torque.legend(ncol=3, loc="upper right")
         gait_bars(bars, run, config.sim.contact_threshold, part)
@@ -103,7 +104,7 @@ def _forces(axis: Axes, run: Trajectory, part: np.ndarray) -> None:
     axis.legend(ncol=4, loc="upper right")
 
 
-def gait_bars(axis: Axes, run: Trajectory, threshold: float, part: np.ndarray) -> None:
+def gait_bars(axis: Axes, run: Trajectory | Series, threshold: float, part: np.ndarray) -> None:
     """Gait diagram: a bar where a foot touches, a thin line where it is scheduled to."""
     t = run.time[part]
     for row, leg in enumerate(reversed(Leg)):
@@ -112,7 +113,7 @@ def gait_bars(axis: Axes, run: Trajectory, threshold: float, part: np.ndarray) -
             t, row + 0.15, row + 0.75, where=touching, color=_LEG_COLOURS[leg], lw=0, step="post"
         )
         stance = np.where(run.stance[part, leg], row + 0.85, np.nan)
-        axis.plot(t, stance, color=_DARK, lw=1.4)
+        axis.plot(t, stance, color=DARK, lw=1.4)
     axis.set_yticks(np.arange(4) + 0.45, [leg.name for leg in reversed(Leg)])
     axis.set_ylim(0, 4.1)
     axis.grid(False)
@@ -139,11 +140,11 @@ def fit_figure(
       path: image file to write.
       names: of the six states.
     """
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         fig, axes = plt.subplots(
             2, len(statistics), figsize=(2.6 * len(statistics), 4.4), sharex=True, squeeze=False
         )
-        colours = (_BLUE, _RED, "#2f855a")
+        colours = (BLUE, RED, "#2f855a")
         for column, (mode, values) in enumerate(statistics.items()):
             for row, states in enumerate(((0, 1, 2), (3, 4, 5))):
                 axis = axes[row, column]
@@ -154,7 +155,7 @@ def fit_figure(
                         1e3 * time, mean - std, mean + std, color=colour, alpha=0.18, lw=0
                     )
                     axis.plot(1e3 * time, values["max"][:, state], ":", color=colour, lw=0.8)
-                axis.axhspan(-1e-4, 1e-4, color=_GREY, alpha=0.25, lw=0, zorder=0)
+                axis.axhspan(-1e-4, 1e-4, color=GREY, alpha=0.25, lw=0, zorder=0)
                 axis.set_yscale("symlog", linthresh=1e-4)
                 axis.set_yticks([-1e-2, -1e-4, 0.0, 1e-4, 1e-2])
                 axis.set_ylim(-_error_limit(statistics, states), _error_limit(statistics, states))

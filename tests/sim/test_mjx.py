@@ -18,7 +18,8 @@ TICKS, PER_TICK = 60, 5
 
 @pytest.fixture(scope="module")
 def config():
-    return load_config(RunConfig, None, {"duration": 0.3, "sim.contacts": "feet"})
+    chosen = {"duration": 0.3, "sim.contacts": "feet", "push.times": [0.1], "push.forward": 2.0}
+    return load_config(RunConfig, None, chosen)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,14 @@ def test_three_tenths_of_a_second_of_trot_agree(both):
     np.testing.assert_allclose(log.qpos.reshape(-1, 15), in_c.qpos, atol=1e-9)
     np.testing.assert_allclose(log.qvel.reshape(-1, 15), in_c.qvel, atol=1e-7)
     np.testing.assert_allclose(log.torque.reshape(-1, 4, 3), in_c.torque, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_both_were_pushed(both):
+    log, in_c = both
+    for speed in (log.qvel.reshape(-1, 15)[:, 0], in_c.qvel[:, 0]):
+        # 2 N s on 12.7 kg, of which the stance legs take back a part while it acts
+        assert 0.05 < speed[200] - speed[100] < 2.0 / 12.743
 
 
 @pytest.mark.slow

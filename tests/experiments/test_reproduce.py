@@ -1,0 +1,157 @@
+"""Reproduction and envelope as a user runs them, and the rules of their tables."""
+
+import importlib
+import json
+import sys
+from argparse import Namespace
+
+import pytest
+
+from kjax.gait import bound
+
+
+@pytest.fixture(scope="module")
+def experiments(repository):
+    """The experiment modules; scripts find each other by lying in one folder."""
+    sys.path.insert(0, str(repository / "experiments"))
+    names = ("paper_results", "reproduce", "envelope")
+    yield Namespace(**{name: importlib.import_module(name) for name in names})
+    sys.path.remove(str(repository / "experiments"))
+
+
+def test_every_experiment_and_axis_has_a_config_that_loads(experiments):
+    for experiment in experiments.paper_results.EXPERIMENTS:
+        config = experiments.paper_results.base_config(experiment, "planar", quick=False)
+        chosen = experiments.paper_results.episodes(experiment, config, seeds=4, terrains=3)
+        assert len(chosen) == (3 if experiment.vary == "terrain" else 4)
+        assert len(set(chosen)) == len(chosen)
+        assert len({one.seed for one in chosen}) == len(chosen)
+    for axis in experiments.envelope.AXES:
+        config = experiments.envelope._config(axis, "planar", Namespace(quick=False))
+        easy = experiments.envelope._changed(config, axis.vary(axis.easy, 3, config), 3)
+        hard = experiments.envelope._changed(config, axis.vary(axis.hard, 3, config), 3)
+        assert easy.seed == 3
+        assert easy != hard
+
+
+def test_request_times_cover_a_cycle_of_the_gait_that_is_left(experiments):
+    by_name = {e.name: e for e in experiments.paper_results.EXPERIMENTS}
+    for name, cycle in (("trot_to_bound", 0.5), ("bound_to_trot", 0.35)):
+        config = experiments.paper_results.base_config(by_name[name], "planar", quick=False)
+        chosen = experiments.paper_results.episodes(by_name[name], config, seeds=5, terrains=1)
+        late = [one.gait.times[-1] - 3.0 for one in chosen]
+        assert late == pytest.approx([cycle * i / 5 for i in range(5)])
+
+
+def test_the_naive_switch_is_asked_for_in_the_middle_of_a_stance(experiments):
+    gait = bound(0.1, 0.1, 0.05, 0.1, ramp_start=0.5, ramp_cycles=2)
+    # By hand: cycles of 0.25, 0.30 and then 0.35 s begin at 0, 0.25, 0.55, 0.90, ...
+    times = experiments.paper_results.mid_stances(gait, 1.0, 1.58, 4)
+    rear, front = 1.55 + 0.2, 1.90
+    expected = [rear + 0.25 * 0.05, front + 0.375 * 0.1, rear + 0.5 * 0.05, front + 0.625 * 0.1]
+    assert times == pytest.approx(expected)
+
+
+def test_a_target_is_met_by_the_number_that_it_is_for(experiments):
+    row, judge = experiments.paper_results.Row, experiments.reproduce._row
+    total = {"runs": 8, "falls": 1, "crossed": 7, "a": {"median": 1.0, "worst": -3.0, "n": 7}}
+    floors = {"x": 0.1, "y": 0.2}
+
+    def met(**fields):
+        return judge(row(label="", **fields), total, floors)["met"]
+
+    assert met(metric="a", target=2.0)
+    assert not met(metric="a", target=2.0, of="worst")
+    assert met(metric="a") is None
+    assert met(metric="missing", target=2.0) is False
+    assert not met(metric="falls", target=0)
+    assert met(metric="crossed", target=0.8)
+    assert not met(metric="crossed", target=0.9)
+
+
+def test_an_episode_passes_if_it_did_what_was_asked(experiments):
+    axes = {axis.name: axis for axis in experiments.envelope.AXES}
+    upright = {"fell": False, "crossed": False, "velocity_late_mean_mps": 0.85}
+
+    def passed(name, value, **more):
+        return experiments.envelope._passed(axes[name], value, upright | more)
+
+    assert passed("speed_trot", 1.0)
+    assert not passed("speed_trot", 1.2)
+    assert not passed("speed_trot", 1.0, fell=True)
+    assert passed("friction_trot", 0.4, velocity_late_mean_mps=0.3)
+    assert not passed("friction_trot", 0.4)
+    assert not passed("blocks_trot", 0.05)
+    assert passed("push_bound", 5.0)
+
+
+@pytest.mark.parametrize(
+    ("script", "words", "part"),
+    [
+        ("reproduce", ["--only", "trott"], "--only: got 'trott', wanted some of koopman_fit, trot"),
+        ("reproduce", ["--seeds", "0"], "--seeds: got 0, wanted at least 1"),
+        ("reproduce", ["--base", "both", "--terrains", "x"], "--terrains"),
+        ("envelope", ["--only", "speed"], "wanted some of speed_trot"),
+        ("envelope", ["--jobs", "0"], "--jobs: got 0, wanted at least 1"),
+        ("envelope", ["--sedes", "3"], "--sedes"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(
+    experiments, script, words, part, monkeypatch, capsys
+):
+    monkeypatch.setattr(sys, "argv", [script, *words])
+    with pytest.raises(SystemExit) as caught:
+        getattr(experiments, script).main()
+    assert caught.value.code == 2
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1, text
+    assert part in text
+
+
+@pytest.mark.slow
+def test_a_quick_reproduction_leaves_page_table_and_json_and_goes_on(
+    experiments, tmp_path, monkeypatch, capsys, repository
+):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(repository / ".cache" / "jax"))
+    words = ["reproduce", "--quick", "--jobs", "2", "--only", "trot_rough", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    experiments.reproduce.main()
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "results.json", "table.md", "index.html", "figures", "episodes.json", "series"
+    }  # fmt: skip
+    record = json.loads((tmp_path / "results.json").read_text())
+    one = record["experiments"]["trot_rough"]["planar"]
+    assert one["summary"]["runs"] == 2
+    assert one["rows"][0]["target"] == 0.98
+    page = (tmp_path / "index.html").read_text()
+    assert "figures/trot_rough_planar.png" in page
+    assert (tmp_path / "figures" / "trot_rough_planar.png").exists()
+    assert "rough trot" in (tmp_path / "table.md").read_text()
+
+    episodes = (tmp_path / "episodes.json").read_text()
+    experiments.reproduce.main()
+    assert (tmp_path / "episodes.json").read_text() == episodes  # nothing was run again
+    assert "changed" not in capsys.readouterr().out
+
+    rough = experiments.paper_results.EXPERIMENTS[4]
+    assert rough.name == "trot_rough"
+    rough.overrides["leg.apex"] = 0.09
+    try:
+        monkeypatch.setattr(sys, "argv", [*words[:4], "--only", "koopman_fit", *words[-2:]])
+        monkeypatch.setattr(experiments.reproduce, "_fit", lambda *a, **k: {
+            "largest_scale_within_tolerance": {"trot": {"max": None}}})  # fmt: skip
+        experiments.reproduce.main()
+    finally:
+        del rough.overrides["leg.apex"]
+    assert "trot_rough (planar): its config has changed; its results are dropped" in (
+        capsys.readouterr().out
+    )
+
+
+def test_the_floor_of_a_config_is_reported_with_its_rmse(experiments):
+    row = experiments.reproduce._row(
+        experiments.paper_results.Row(metric="velocity_rmse_mps", label=""),
+        {"runs": 1, "falls": 0},
+        {"4_mps2": 0.008, "mu_g": 0.006},
+    )
+    assert row["floor"] == [0.008, 0.006]

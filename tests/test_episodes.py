@@ -1,0 +1,135 @@
+"""Many episodes: what is finished is kept, what is kept is not repeated, what changed is."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from kjax import episodes
+from kjax.config import PushConfig, RunConfig, load_config
+from kjax.sim.episode import fixed_part, metrics
+from kjax.sim.mujoco_loop import build_simulation, simulate
+
+SHORT = {"duration": 0.7, "command.times": [0.0, 0.3], "command.velocities": [0.0, 0.2]}
+WALL = {"plan_ms_median", "plan_ms_p99", "act_ms_median", "act_ms_p99", "realtime_factor"}
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_config(
+        RunConfig, None, SHORT | {"gait.names": ["trot", "bound"], "gait.times": [0.0, 0.5]}
+    )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def simulation(config):
+    """Built once; the runner finds it where a worker would have left it."""
+    built = build_simulation(config)
+    episodes._built.clear()
+    episodes._built[fixed_part(config)] = built
+    return built
+
+
+def seeds(config, count):
+    return [dataclasses.replace(config, seed=seed) for seed in range(count)]
+
+
+def without_times(results):
+    return [{k: v for k, v in result.items() if k not in WALL} for result in results]
+
+
+def test_killed_and_resumed_equals_uninterrupted(config, tmp_path, monkeypatch):
+    chosen = seeds(config, 3)
+    whole = episodes.Store(tmp_path / "whole" / "episodes.json", "code")
+    (tmp_path / "whole").mkdir()
+    with episodes.open_runner(whole) as run:
+        expected = run(chosen)
+
+    path = tmp_path / "episodes.json"
+    real, started = episodes.simulate, []
+
+    def killed(simulation, config, on_tick=None):
+        if len(started) == 2:
+            raise KeyboardInterrupt
+        started.append(config.seed)
+        return real(simulation, config)
+
+    monkeypatch.setattr(episodes, "simulate", killed)
+    with pytest.raises(KeyboardInterrupt), episodes.open_runner(episodes.Store(path, "code")) as go:
+        go(chosen)
+    assert len(json.loads(path.read_text())["episodes"]) == 2
+    started[:] = [None]
+    with episodes.open_runner(episodes.Store(path, "code")) as go:
+        resumed = go(chosen)
+        assert started == [None, 2]
+        assert go(chosen) == resumed  # finished: nothing runs, or `killed` would have ended it
+    assert without_times(resumed) == without_times(expected)
+
+
+def test_another_config_is_run_and_other_code_begins_afresh(config, tmp_path):
+    path = tmp_path / "episodes.json"
+    store = episodes.Store(path, "code")
+    with episodes.open_runner(store) as run:
+        run(seeds(config, 1))
+        run([dataclasses.replace(config, push=PushConfig(times=(0.2,), forward=1.0))])
+    assert len(store.done) == 2
+    assert not episodes.Store(path, "code").outdated
+    other = episodes.Store(path, "other code")
+    assert other.outdated
+    assert other.done == {}
+
+
+def test_a_call_ends_when_enough_is_known(config, tmp_path):
+    store = episodes.Store(tmp_path / "episodes.json", "code")
+    with episodes.open_runner(store) as run:
+        results = run(seeds(config, 3), enough=lambda results: len(results) >= 1)
+    assert [result is None for result in results] == [False, True, True]
+
+
+def test_what_is_recorded_of_a_run_is_made_again_where_it_is_missing(config, tmp_path):
+    store = episodes.Store(tmp_path / "episodes.json", "code")
+    (one,) = seeds(config, 1)
+
+    def record(run, path):
+        np.savez(path, x=run.x)
+
+    with episodes.open_runner(store, record=record) as run:
+        run([one])
+        file = episodes.series_file(store, one)
+        assert np.load(file)["x"].shape == (700, 6)
+        file.unlink()
+        run([one])
+        assert file.exists()
+
+
+def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config, simulation):
+    """As if it had been built for them; the compiled calls are the same."""
+    other = load_config(
+        RunConfig,
+        None,
+        {
+            "duration": 0.7,
+            "seed": 4,
+            "command.times": [0.0, 0.1],
+            "command.velocities": [0.1, 0.3],
+            "gait.names": ["trot", "bound"],
+            "gait.times": [0.0, 0.4],
+            "sim.friction": 0.6,
+            "push.times": [0.2],
+            "push.forward": 1.0,
+        },
+    )
+    shared, own = simulate(simulation, other), simulate(build_simulation(other))
+    assert shared.time[np.argmax(np.diff(shared.gait) != 0)] == pytest.approx(0.399)
+    # 1e-9: constants that the compiler folds in one of the two round differently
+    np.testing.assert_allclose(shared.qpos, own.qpos, atol=1e-9)
+    np.testing.assert_allclose(shared.velocity_command, own.velocity_command, atol=1e-12)
+    first, second = metrics(shared, other), metrics(own, other)
+    assert first["fell"] == second["fell"]
+
+
+def test_a_config_that_needs_another_simulation_is_refused(config, simulation):
+    with pytest.raises(ValueError, match="fixed_part"):
+        simulate(simulation, dataclasses.replace(config, bound=dataclasses.replace(
+            config.bound, apex=0.1)))  # fmt: skip
