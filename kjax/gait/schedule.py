@@ -141,7 +141,7 @@ def bound(
       second_flight: after it [s].
       ramp_start: see ``Gait``.
       ramp_cycles: see ``Gait``.
-      leave_anywhere: allow a switch in every phase; else in the first flight only (Raibert's
+      leave_anywhere: allow a switch at any time; else as the first flight begins only (Raibert's
         rule: no foot is kicked into the ground that carries no weight).
       leave_through: see ``Gait``.
     """
@@ -156,6 +156,7 @@ def bound(
         ),
         ramp_start=ramp_start,
         ramp_cycles=ramp_cycles,
+        leave_when_done=not leave_anywhere,
         leave_through=leave_through,
     )
 
