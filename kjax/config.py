@@ -9,6 +9,7 @@ import itertools
 import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -305,7 +306,11 @@ class LateralConfig:
     friction: NonNegative = 0.7
     """Sideways over vertical force of a foot, at most [-]."""
     friction_offset: NonNegative = 3.0
-    """Sideways force allowed beyond that [N]."""
+    """Horizontal force allowed beyond that [N]."""
+    plan_friction: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 0.8
+    """The planned F_x is cut at this part of F_z; inf leaves it to the LMPC's box [-]."""
+    plan_friction_bound: Annotated[float, Field(ge=0, allow_inf_nan=True)] = inf
+    """The same in a bound, which loses speed by it: its F_z falls to bound.force_z_min [-]."""
     velocity_gain: NonNegative = 0.05
     """Sideways foothold per sideways velocity, beyond Raibert's law [s]."""
 

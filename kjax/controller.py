@@ -275,7 +275,8 @@ def build_controller(config: RunConfig) -> Controller:
             stance_time=params.schedule.stance_time[where],
             velocity=state.velocity,
         )
-        torque = base.torque(robot, settings, params.lateral, view, command, observation)
+        sideways = lateral.for_gait(params.lateral, state.clock.gait)
+        torque = base.torque(robot, settings, sideways, view, command, observation)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
         return state._replace(swing=swings), jnp.where(readable, torque, 0.0)
 
@@ -344,6 +345,9 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
                 ridge=jnp.asarray(sideways.force_weight),
                 friction=jnp.asarray(sideways.friction),
                 friction_offset=jnp.asarray(sideways.friction_offset),
+                friction_x=jnp.asarray(
+                    np.where(is_bound, sideways.plan_friction_bound, sideways.plan_friction)
+                ),
                 foothold_gain=jnp.asarray(sideways.velocity_gain),
             ),
             command=Command(

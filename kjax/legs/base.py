@@ -55,7 +55,7 @@ class Base(NamedTuple):
       track: observation at ``init`` -> (2,) cosine and sine of the heading to keep, world; ``None``
         where the base keeps it.
       view: (robot, track, observation) -> view.
-      torque: (robot, swing settings of the gait, lateral settings, view, command, observation) ->
+      torque: (robot, swing and lateral settings of the gait, view, command, observation) ->
         joint torques (4, 3), not yet within the robot's limits [N m].
     """
 
@@ -138,6 +138,9 @@ def _free_torque(
     follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
     force = lateral.stance_forces(sideways, robot, body, command.stance, command.force)
     press = spatial_stance_torque(robot, body.hip, body.planar.trig, force)
+    # A sideways force has nothing to push against before the foot is down: keep the leg upright.
+    loose = command.stance & ~observation.contact
+    press = press.at[:, 0].set(jnp.where(loose, follow[:, 0], press[:, 0]))
     return jnp.where(command.stance[:, None], press, follow)
 
 

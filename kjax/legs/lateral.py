@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from kjax.legs.spatial import SpatialState, turn, turn_back
 from kjax.types import RobotParams
@@ -30,7 +30,9 @@ class LateralParams(NamedTuple):
       weights: (6,) of the wrench (force x, y, z, moment x, y, z) [1/N^2, 1/(N m)^2].
       ridge: weight of a change of the plan's forces [1/N^2].
       friction: sideways over vertical force of a foot, at most [-].
-      friction_offset: sideways force beyond that [N].
+      friction_offset: horizontal force beyond that [N].
+      friction_x: the same of the planned forces; (G,) by gait in the controller's parameters, one
+        number where it is used [-].
       foothold_gain: sideways foothold per sideways velocity, beyond Raibert's law [s].
     """
 
@@ -41,7 +43,13 @@ class LateralParams(NamedTuple):
     ridge: Float[Array, ""]
     friction: Float[Array, ""]
     friction_offset: Float[Array, ""]
+    friction_x: Float[Array, "*gait"]
     foothold_gain: Float[Array, ""]
+
+
+def for_gait(params: LateralParams, gait: Int[Array, ""]) -> LateralParams:
+    """Settings with those that depend on the gait picked for ``gait``."""
+    return params._replace(friction_x=params.friction_x[gait])
 
 
 def wrench_map(arms: Float[Array, "4 3"], stance: Bool[Array, "4"]) -> Float[Array, "6 12"]:
@@ -113,7 +121,13 @@ def stance_forces(
       planned: (4, 2) the LMPC's forces (x, z), body frame of the sagittal plane [N].
     """
     flat = planned @ body.planar.rotation.T
-    forces = jnp.stack([flat[:, 0], jnp.zeros_like(flat[:, 0]), flat[:, 1]], axis=-1)
+    endless = jnp.isinf(params.friction_x)  # times no force at all it would be NaN
+    friction = jnp.where(endless, 0.0, params.friction_x) * jnp.maximum(flat[:, 1], 0.0)
+    limit = jnp.where(endless, jnp.inf, friction + params.friction_offset)
+    # The plan's box knows no friction. Of a pair that slides, one foot lets go first, and the
+    # trunk rolls.
+    along = jnp.clip(flat[:, 0], -limit, limit)
+    forces = jnp.stack([along, jnp.zeros_like(along), flat[:, 1]], axis=-1)
     below = jnp.stack([jnp.zeros_like(body.com[0])] * 2 + [robot.foot_radius])
     arms = turn_back(body.heading, body.feet - below - body.com)
     wrench = wrench_map(arms, stance) @ forces.reshape(-1)

@@ -233,9 +233,9 @@ def _heading(rotation: Float[Array, "3 3"]) -> Float[Array, "2"]:
     """Unit vector of the nose's horizontal part; straight ahead where the nose is vertical."""
     nose = rotation[:2, 0]
     square = jnp.sum(nose**2)
-    upright = square > 1e-12
+    vertical = square < 1e-12  # not for NaN, which shall stay
     ahead = jnp.stack([jnp.ones_like(square), jnp.zeros_like(square)])
-    return jnp.where(upright, nose / jnp.sqrt(jnp.where(upright, square, 1.0)), ahead)
+    return jnp.where(vertical, ahead, nose / jnp.sqrt(jnp.where(vertical, 1.0, square)))
 
 
 def _in_leg_plane(robot: RobotParams, foot: Float[Array, "4 2"]) -> Float[Array, "4 3"]:

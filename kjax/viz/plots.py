@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 
 from kjax.config import RunConfig
 from kjax.robots.go1 import JOINTS
+from kjax.sim import free_base
 from kjax.sim.episode import Trajectory
 from kjax.types import Leg
 
@@ -52,8 +53,15 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         velocity.legend(ncol=3, loc="upper left")
         velocity.set_title(title, loc="left", fontsize=9)
 
-        pitch.plot(t, np.degrees(run.x[:, 2]), color=_BLUE)
+        if free_base.is_free(run.qpos):
+            roll, _, yaw = free_base.attitude(run.qpos)
+            pitch.plot(t, np.degrees(roll), color=_RED, label="roll")
+            pitch.plot(t, np.degrees(np.unwrap(yaw) - yaw[0]), color=_GREY, label="yaw")
+        pitch.plot(t, np.degrees(run.x[:, 2]), color=_BLUE, label="pitch")
         pitch.set_ylabel("pitch [deg]\nnose up +")
+        if free_base.is_free(run.qpos):
+            pitch.set_ylabel("angles [deg]")
+            pitch.legend(ncol=3, loc="upper left")
 
         height.plot(t, run.x[:, 1], color=_BLUE)
         height.axhline(config.lmpc.height, ls="--", color=_DARK, lw=0.9)
