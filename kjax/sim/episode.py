@@ -136,7 +136,7 @@ def sagittal(observe: Observe, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.n
     Of a free base: in the plane of its heading, with the progress along the heading at the start.
     """
     base = build_base("free" if free_base.is_free(qpos) else "planar")
-    track = base.track(observe(qpos[0], qvel[0], jnp.zeros(64)))
+    track = base.track(observe(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]), jnp.zeros(64)))
 
     def one(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         body = base.view(go1.PARAMS, track, observe(qpos, qvel, jnp.zeros(64))).planar
