@@ -22,6 +22,7 @@ from kjax import cli
 from kjax.config import RunConfig
 from kjax.sim.episode import initial_state, metrics
 from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
+from kjax.sim.observe import noise_dim
 
 BENCHMARKS = ("controller",)
 CALLS = 2000  # timed calls of each function
@@ -92,9 +93,10 @@ def _walk(simulation: Simulation) -> tuple[list[Any], list[np.ndarray], mujoco.M
     data.qpos[:], data.qvel[:] = initial_state(simulation.config, model.nq, model.nv)
     mujoco.mj_forward(model, data)
     states, sensed = [], []
+    noise = noise_dim(simulation.config.sim.base)
     state = None
     for i in range(WALK):
-        now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(30)])
+        now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(noise)])
         state = simulation.init(now) if state is None else state
         if i % 5 == 0:
             state, _ = simulation.plan(state, now)

@@ -9,6 +9,7 @@ import itertools
 import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -323,9 +324,41 @@ class LegConfig:
     kd: NonNegative = 3.0
     """Damping of thigh and calf joint in swing [N m s/rad]."""
     kp_abduction: NonNegative = 200.0
-    """Stiffness that holds the abduction joint of the planar robot [N m/rad]."""
+    """Stiffness of the abduction joint: in swing, or always on the planar base [N m/rad]."""
     kd_abduction: NonNegative = 4.0
-    """Damping of the abduction joint of the planar robot [N m s/rad]."""
+    """Damping of the abduction joint, likewise [N m s/rad]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class LateralConfig:
+    """Regulator of roll, yaw and sideways motion; for sim.base = "free" only."""
+
+    roll_stiffness: NonNegative = 60.0
+    """Roll moment per roll [N m/rad]."""
+    roll_damping: NonNegative = 4.0
+    """Roll moment per roll rate [N m s/rad]."""
+    yaw_stiffness: NonNegative = 20.0
+    """Yaw moment per yaw away from the heading at the start [N m/rad]."""
+    yaw_damping: NonNegative = 3.0
+    """Yaw moment per yaw rate [N m s/rad]."""
+    damping: NonNegative = 30.0
+    """Sideways force per sideways velocity of the centre of mass [N s/m]."""
+    wrench_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (1.0, 0.3, 1.0, 20.0, 20.0, 10.0)
+    """Weights of the wrench (force x, y, z, moment x, y, z) [1/N^2, 1/(N m)^2]."""
+    force_weight: Positive = 1e-3
+    """Weight of a change of the planned foot forces [1/N^2]."""
+    friction: NonNegative = 0.7
+    """Sideways over vertical force of a foot, at most [-]."""
+    friction_offset: NonNegative = 3.0
+    """Horizontal force allowed beyond that [N]."""
+    plan_friction: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 0.8
+    """The planned F_x is cut at this part of F_z; inf leaves it to the LMPC's box [-]."""
+    plan_friction_bound: Annotated[float, Field(ge=0, allow_inf_nan=True)] = inf
+    """The same in a bound, which loses speed by it: its F_z falls to bound.force_z_min [-]."""
+    velocity_gain: NonNegative = 0.05
+    """Sideways foothold per sideways velocity, beyond Raibert's law [s]."""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -420,7 +453,7 @@ class SimConfig:
     sim_dt: Positive = 0.001
     """Physics step; torques are recomputed at each [s]."""
     base: Literal["planar", "free"] = "planar"
-    """Trunk on two slides and a pitch hinge, or free; the controller walks the planar one [-]."""
+    """Trunk on two slides and a pitch hinge, or free; the controller is built for either [-]."""
     friction: Positive = 0.8
     """Sliding friction coefficient of the feet [-]."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
@@ -459,6 +492,8 @@ class RunConfig:
     """Multi-phase horizon of the bound."""
     leg: LegConfig = LegConfig()
     """Swing legs."""
+    lateral: LateralConfig = LateralConfig()
+    """Roll, yaw and sideways motion of a free base."""
     sim: SimConfig = SimConfig()
     """Physics."""
     terrain: TerrainConfig = TerrainConfig()

@@ -18,9 +18,9 @@ from kjax import gait, qp
 from kjax.config import RunConfig
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
-from kjax.legs import swing
-from kjax.legs.kinematics import PlanarState, planar_state
-from kjax.legs.stance import stance_torque
+from kjax.legs import lateral, swing
+from kjax.legs.base import LegCommand, build_base
+from kjax.legs.kinematics import PlanarState
 from kjax.mpc import multiphase
 from kjax.mpc.lmpc import (
     LmpcTables,
@@ -46,6 +46,7 @@ class ControllerParams(NamedTuple):
         ``gait.reference``.
       multiphase: LMPC over a gait cycle, for gaits that use it.
       swing: swing settings.
+      lateral: regulator of roll, yaw and sideways motion; of no effect on the planar base.
       command: forward velocity over time.
       height: (G,) mean height of the centre of mass [m].
       follow_ground: 1 to measure it from the stance feet, 0 from z = 0 [-].
@@ -63,6 +64,7 @@ class ControllerParams(NamedTuple):
     reference: Float[Array, "G levels P samples 4"]
     multiphase: multiphase.MultiPhaseParams
     swing: swing.SwingParams
+    lateral: lateral.LateralParams
     command: Command
     height: Float[Array, "G"]
     follow_ground: Float[Array, ""]
@@ -87,6 +89,8 @@ class ControllerState(NamedTuple):
       plan: (4k,) last force plan, body frame [N].
       force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
       swing: state of the swing legs.
+      track: (2,) cosine and sine of the heading to keep, the trunk's at ``init``, world [-];
+        ``None`` on the planar base.
     """
 
     time: Float[Array, ""]
@@ -100,6 +104,7 @@ class ControllerState(NamedTuple):
     plan: Float[Array, "nu"]
     force: Float[Array, "4 2"]
     swing: swing.SwingState
+    track: Float[Array, "2"] | None
 
 
 class PlanInfo(NamedTuple):
@@ -167,30 +172,35 @@ def build_controller(config: RunConfig) -> Controller:
     measured_feet = config.koopman.feet == "measured"
     cycle_nodes = int(_cycle_nodes(build_gaits(config), config).sum(axis=1).max())
     cycle_nodes += cycle_nodes > 0  # the present phase may hold one more, part now and part later
+    base = build_base(config.sim.base)
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
-        body = planar_state(params.robot, _cast(observation, params))
+        observation = _cast(observation, params)
+        track = base.track(observation)
+        view = base.view(params.robot, track, observation)
         zero = jnp.zeros_like(params.position_slack)
         return ControllerState(
             time=zero,
             clock=gait.start(params.gaits[0], zero - lmpc.control_dt),  # first plan: phase 0
             stance=jnp.ones((4,), bool),
-            position=body.x[0],
+            position=view.planar.x[0],
             velocity_command=zero,
             ground=zero,
             velocity=zero,
             correction=jnp.zeros((2,), zero.dtype),
             plan=jnp.zeros_like(params.tables.lower[0]),
             force=jnp.zeros((4, 2), zero.dtype),
-            swing=swing.initial_swing(body.feet),
+            swing=swing.initial_swing(view.feet),
+            track=track,
         )
 
     def plan(
         params: ControllerParams, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, PlanInfo]:
         observation = _cast(observation, params)
-        readable = _all_finite(observation)
-        body = planar_state(params.robot, _stand_in(observation, readable, params))
+        readable = _all_finite(observation, state.track)
+        view = base.view(params.robot, state.track, _stand_in(observation, readable, params))
+        body = view.planar
         schedule = params.schedule
 
         wanted = params.gaits[_piece(params.gait_times, state.time)]
@@ -201,7 +211,7 @@ def build_controller(config: RunConfig) -> Controller:
         # A new gait gives legs that are in the air already another time to come down.
         anew = ~stance & (clock.gait != state.clock.gait)
         swings = swing.begin_swings(
-            state.swing, lifting | anew, body.feet, gait.time_to_touchdown(schedule, clock)
+            state.swing, lifting | anew, view.feet, gait.time_to_touchdown(schedule, clock)
         )
         swings = swings._replace(held=swings.held & ~stance)
 
@@ -330,6 +340,7 @@ def build_controller(config: RunConfig) -> Controller:
             plan=solved.plan,
             force=solved.ends[LEG_PAIR] * stance[:, None],
             swing=jax.tree.map(lambda new, old: jnp.where(readable, new, old), swings, state.swing),
+            track=state.track,
         )
         info = PlanInfo(
             status=jnp.where(readable, solved.status, qp.Status.NON_FINITE).astype(jnp.int32),
@@ -345,10 +356,10 @@ def build_controller(config: RunConfig) -> Controller:
         params: ControllerParams, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, Array]:
         observation = _cast(observation, params)
-        readable = _all_finite(observation)
+        readable = _all_finite(observation, state.track)
         observation = _stand_in(observation, readable, params)
         robot = params.robot
-        body = planar_state(robot, observation)
+        view = base.view(robot, state.track, observation)
         where = (state.clock.gait, state.clock.phase)
 
         settings = swing.for_gait(params.swing, state.clock.gait)
@@ -357,30 +368,18 @@ def build_controller(config: RunConfig) -> Controller:
             state.swing,
             ~state.stance & readable,
             observation.contact,
-            body.feet,
+            view.feet,
             sim_dt,
         )
-        x_target = swing.foothold(
-            robot,
-            settings,
-            body,
-            jnp.maximum(swings.duration - swings.elapsed, 0.0),
-            params.schedule.stance_time[where],
-            state.velocity + state.correction[0],
+        command = LegCommand(
+            stance=state.stance,
+            force=state.force,
+            swing=swings,
+            stance_time=params.schedule.stance_time[where],
+            velocity=state.velocity + state.correction[0],
         )
-        target = jnp.stack([x_target, jnp.full_like(x_target, robot.foot_radius)], axis=-1)
-        position, velocity = swing.foot_reference(settings, swings, target)
-        angle, rate = swing.joint_reference(robot, body, position, velocity)
-        follow = swing.swing_torque(
-            params.swing, observation.joint_pos, observation.joint_vel, angle, rate
-        )
-        press = stance_torque(robot, body.trig, state.force)
-        sagittal = jnp.where(state.stance[:, None], press, follow)
-        abduction = (
-            -params.swing.kp[0] * observation.joint_pos[:, 0]
-            - params.swing.kd[0] * observation.joint_vel[:, 0]
-        )
-        torque = jnp.concatenate([abduction[:, None], sagittal], axis=-1)
+        sideways = lateral.for_gait(params.lateral, state.clock.gait)
+        torque = base.torque(robot, settings, sideways, view, command, observation)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
         return state._replace(swing=swings), jnp.where(readable, torque, 0.0)
 
@@ -407,7 +406,7 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
     dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
     gaits = build_gaits(config)
     names = [g.name for g in gaits]
-    leg, bound = config.leg, config.bound
+    leg, bound, sideways = config.leg, config.bound, config.lateral
     is_bound = np.array([name == "bound" for name in names])
     sole = robot.foot_radius - bound.height
     bound_feet = ((bound.feet_front, float(sole)), (-bound.feet_rear, float(sole)))
@@ -441,6 +440,19 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
                 hold_after=jnp.asarray(leg.hold_after),
                 kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
                 kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
+            ),
+            lateral=lateral.LateralParams(
+                roll=jnp.asarray([sideways.roll_stiffness, sideways.roll_damping]),
+                yaw=jnp.asarray([sideways.yaw_stiffness, sideways.yaw_damping]),
+                damping=jnp.asarray(sideways.damping),
+                weights=jnp.asarray(sideways.wrench_weights),
+                ridge=jnp.asarray(sideways.force_weight),
+                friction=jnp.asarray(sideways.friction),
+                friction_offset=jnp.asarray(sideways.friction_offset),
+                friction_x=jnp.asarray(
+                    np.where(is_bound, sideways.plan_friction_bound, sideways.plan_friction)
+                ),
+                foothold_gain=jnp.asarray(sideways.velocity_gain),
             ),
             command=Command(
                 times=jnp.asarray(config.command.times),
@@ -562,8 +574,10 @@ def _cast(observation: Observation, params: ControllerParams) -> Observation:
     return floats._replace(contact=jnp.asarray(observation.contact, bool))
 
 
-def _all_finite(observation: Observation) -> Array:
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in observation[:-1]]).all()
+def _all_finite(observation: Observation, track: Array | None) -> Array:
+    """Whether the observation, and the heading that it is seen from, hold numbers only."""
+    leaves = [*observation[:-1], *([] if track is None else [track])]
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()
 
 
 def _stand_in(observation: Observation, readable: Array, params: ControllerParams) -> Observation:

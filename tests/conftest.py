@@ -136,6 +136,14 @@ def planar_go1():
 
 
 @pytest.fixture(scope="session")
+def free_go1():
+    """Go1 in C MuJoCo on a free joint, assembled here without ``kjax.sim``."""
+    spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
+    spec.body("trunk").add_freejoint(name="root")
+    return spec.compile()
+
+
+@pytest.fixture(scope="session")
 def leg_joints(planar_go1):
     """Joint ids (4, 3) by name: leg order of ``types.Leg``, then abduction, thigh, calf."""
     names = ("abduction", "thigh", "calf")

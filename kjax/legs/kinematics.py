@@ -89,6 +89,21 @@ def inverse(
     return jax.lax.optimization_barrier(angles)
 
 
+def joint_rates(
+    robot: RobotParams, trig: LegTrig, velocity: Float[Array, "4 2"]
+) -> Float[Array, "4 2"]:
+    """Thigh and calf rates [rad/s] that move the feet with a velocity (x, z), trunk frame [m/s].
+
+    A leg too near its singular straight posture gets none.
+    """
+    J = foot_jacobian(robot, trig)
+    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+    safe = jnp.where(jnp.abs(det) > 5e-3, det, jnp.inf)
+    thigh = (J[:, 1, 1] * velocity[:, 0] - J[:, 0, 1] * velocity[:, 1]) / safe
+    calf = (J[:, 0, 0] * velocity[:, 1] - J[:, 1, 0] * velocity[:, 0]) / safe
+    return jnp.stack([thigh, calf], axis=-1)
+
+
 class PlanarState(NamedTuple):
     """Sagittal-plane quantities that plan and act share.
 
@@ -147,7 +162,26 @@ def _center_of_mass(
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """Whole-body centre of mass (x, z) in the trunk frame [m] and its rate there [m/s]."""
     m_hip, m_thigh, m_calf = robot.link_mass
-    hip_com, thigh_com, calf_com = (robot.link_com[:, i, ::2] for i in range(3))
+    hip_com = robot.link_com[:, 0, ::2]
+    x, z, x_rate, z_rate = moving_moments(robot, trig, joint_vel)
+    hips = robot.hip_pos[:, ::2]
+    fixed = robot.trunk_mass * robot.trunk_com[::2]
+    fixed = fixed + (m_hip * (hips + hip_com) + (m_thigh + m_calf) * hips).sum(axis=0)
+    moving = jnp.stack([x.sum(), z.sum()])
+    rate = jnp.stack([x_rate.sum(), z_rate.sum()])
+    total = robot.trunk_mass + 4.0 * (m_hip + m_thigh + m_calf)
+    return (fixed + moving) / total, rate / total
+
+
+def moving_moments(
+    robot: RobotParams, trig: LegTrig, joint_vel: Float[Array, "4 3"]
+) -> tuple[Float[Array, "4"], Float[Array, "4"], Float[Array, "4"], Float[Array, "4"]]:
+    """Mass times place (x, z) of thigh and calf about the thigh joint [kg m], and its rates.
+
+    In the leg's plane: the trunk's axes while the abduction joint is at zero.
+    """
+    _, m_thigh, m_calf = robot.link_mass
+    thigh_com, calf_com = (robot.link_com[:, i, ::2] for i in (1, 2))
     l1 = robot.thigh_length
     # Moments of mass about the thigh joint, split by the angle that turns them: a link offset
     # (a, b) at angle q sits at (c a + s b, -s a + c b), its derivative by q is (z, -x) of that.
@@ -158,13 +192,6 @@ def _center_of_mass(
     x12, z12 = trig.c12 * a12 + trig.s12 * b12, -trig.s12 * a12 + trig.c12 * b12
     q1_rate = joint_vel[:, 1]
     q12_rate = q1_rate + joint_vel[:, 2]
-
-    hips = robot.hip_pos[:, ::2]
-    fixed = robot.trunk_mass * robot.trunk_com[::2]
-    fixed = fixed + (m_hip * (hips + hip_com) + (m_thigh + m_calf) * hips).sum(axis=0)
-    moving = jnp.stack([(x1 + x12).sum(), (z1 + z12).sum()])
-    rate = jnp.stack(
-        [(z1 * q1_rate + z12 * q12_rate).sum(), -(x1 * q1_rate + x12 * q12_rate).sum()]
-    )
-    total = robot.trunk_mass + 4.0 * (m_hip + m_thigh + m_calf)
-    return (fixed + moving) / total, rate / total
+    x_rate = z1 * q1_rate + z12 * q12_rate
+    z_rate = -(x1 * q1_rate + x12 * q12_rate)
+    return x1 + x12, z1 + z12, x_rate, z_rate

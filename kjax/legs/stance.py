@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from kjax.legs import spatial
 from kjax.legs.kinematics import LegTrig, foot_jacobian
 from kjax.types import RobotParams
 
@@ -21,3 +22,17 @@ def stance_torque(
       force: (4, 2) force (x, z) on each foot, body frame [N].
     """
     return -jnp.einsum("lij,li->lj", foot_jacobian(robot, trig), force)
+
+
+def spatial_stance_torque(
+    robot: RobotParams, hip: spatial.HipTrig, trig: LegTrig, force: Float[Array, "4 3"]
+) -> Float[Array, "4 3"]:
+    """Torque of all joints (4, 3) [N m] for ground reaction forces of any direction.
+
+    Args:
+      robot: link lengths and abduction offsets.
+      hip: trigonometry of the abduction joints.
+      trig: of the other joints.
+      force: (4, 3) force on each foot, trunk axes [N].
+    """
+    return -jnp.einsum("lij,li->lj", spatial.foot_jacobian(robot, hip, trig), force)

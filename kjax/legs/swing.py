@@ -5,7 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from kjax.legs.kinematics import PlanarState, foot_jacobian, inverse
+from kjax.legs import spatial
+from kjax.legs.kinematics import PlanarState, inverse, joint_rates
 from kjax.types import RobotParams
 
 MAX_JOINT_RATE = 20.0  # rad/s; below the Go1's 30, bounds the reference near singular legs
@@ -47,22 +48,23 @@ class SwingState(NamedTuple):
     """What a swing remembers.
 
     Attributes:
-      lift_off: (4, 2) where the foot left the ground, world [m].
+      lift_off: (4, d) where the foot left the ground, world [m]; d = 2 (x, z) on the planar base,
+        3 in the track frame of ``legs.spatial`` on the free one.
       elapsed: (4,) time since then [s].
       duration: (4,) planned length of the swing [s].
       held: (4,) whether an early contact stopped the foot.
-      held_at: (4, 2) where it did, world [m].
+      held_at: (4, d) where it did, likewise [m].
     """
 
-    lift_off: Float[Array, "4 2"]
+    lift_off: Float[Array, "4 d"]
     elapsed: Float[Array, "4"]
     duration: Float[Array, "4"]
     held: Bool[Array, "4"]
-    held_at: Float[Array, "4 2"]
+    held_at: Float[Array, "4 d"]
 
 
-def initial_swing(feet: Float[Array, "4 2"]) -> SwingState:
-    """State before the first swing, feet (4, 2) in the world [m]."""
+def initial_swing(feet: Float[Array, "4 d"]) -> SwingState:
+    """State before the first swing, feet (4, d) in the world [m]."""
     zeros = jnp.zeros((4,), feet.dtype)
     return SwingState(
         lift_off=feet, elapsed=zeros, duration=zeros + 1.0, held=zeros > 1.0, held_at=feet
@@ -72,7 +74,7 @@ def initial_swing(feet: Float[Array, "4 2"]) -> SwingState:
 def begin_swings(
     state: SwingState,
     lifting: Bool[Array, "4"],
-    feet: Float[Array, "4 2"],
+    feet: Float[Array, "4 d"],
     duration: Float[Array, "4"],
 ) -> SwingState:
     """State with new swings of ``duration`` [s] for the legs that are ``lifting`` off now."""
@@ -90,7 +92,7 @@ def continue_swings(
     state: SwingState,
     swinging: Bool[Array, "4"],
     contact: Bool[Array, "4"],
-    feet: Float[Array, "4 2"],
+    feet: Float[Array, "4 d"],
     dt: float,
 ) -> SwingState:
     """State ``dt`` [s] later; a foot that hits something late in its swing is held where it is."""
@@ -134,10 +136,43 @@ def foothold(
     )
 
 
+def spatial_foothold(
+    robot: RobotParams,
+    body: spatial.SpatialState,
+    along: Float[Array, "4"],
+    remaining: Float[Array, "4"],
+    stance_time: Float[Array, "4"],
+    gain: Float[Array, ""],
+) -> Float[Array, "4 3"]:
+    """Foot centres (4, 3) of the next footholds, track frame [m].
+
+    Sideways, Raibert's law as along the way, with a wanted velocity of zero: from below the thigh
+    joint's place when the leg hangs straight.
+
+    Args:
+      robot: hip positions and abduction offsets.
+      body: the free robot.
+      along: (4,) what ``foothold`` says in the sagittal plane [m].
+      remaining: (4,) time to touchdown [s].
+      stance_time: (4,) length of the stance to come [s].
+      gain: foothold per sideways velocity, beyond Raibert's law [s].
+    """
+    lever = robot.hip_pos @ body.rotation.T + (body.base - body.com)
+    hips = spatial.turn_back(body.heading, lever)
+    across = (
+        hips[:, 1]
+        + robot.abduction_offset
+        + body.com_vel[1] * (remaining + 0.5 * stance_time + gain)
+    )
+    flat = jnp.stack([along - body.planar.x[0], across, jnp.zeros_like(along)], axis=-1)
+    place = spatial.turn(body.heading, flat) + body.com
+    return place.at[:, 2].set(robot.foot_radius)
+
+
 def foot_reference(
-    params: SwingParams, state: SwingState, target: Float[Array, "4 2"]
-) -> tuple[Float[Array, "4 2"], Float[Array, "4 2"]]:
-    """Position [m] and velocity [m/s] (4, 2) of the swing feet, world frame.
+    params: SwingParams, state: SwingState, target: Float[Array, "4 d"]
+) -> tuple[Float[Array, "4 d"], Float[Array, "4 d"]]:
+    """Position [m] and velocity [m/s] (4, d) of the swing feet, frame of the state; z is last.
 
     Horizontally a smoothstep that ends at ``horizontal_fraction``; vertically one up to the apex
     in the first half and one down to the target in the second.
@@ -148,19 +183,20 @@ def foot_reference(
     across = jnp.minimum(phase / params.horizontal_fraction, 1.0)
     shift, shift_rate = _smoothstep(across)
     shift_rate = shift_rate / (params.horizontal_fraction * duration)
-    x = state.lift_off[:, 0] + (target[:, 0] - state.lift_off[:, 0]) * shift
-    v_x = (target[:, 0] - state.lift_off[:, 0]) * shift_rate
+    shift, shift_rate = shift[:, None], shift_rate[:, None]
+    along = state.lift_off[:, :-1] + (target[:, :-1] - state.lift_off[:, :-1]) * shift
+    along_rate = (target[:, :-1] - state.lift_off[:, :-1]) * shift_rate
 
-    top = jnp.maximum(state.lift_off[:, 1], target[:, 1]) + params.apex
+    top = jnp.maximum(state.lift_off[:, -1], target[:, -1]) + params.apex
     rising = phase < 0.5
-    low = jnp.where(rising, state.lift_off[:, 1], top)
-    high = jnp.where(rising, top, target[:, 1])
+    low = jnp.where(rising, state.lift_off[:, -1], top)
+    high = jnp.where(rising, top, target[:, -1])
     climb, climb_rate = _smoothstep(jnp.where(rising, 2.0 * phase, 2.0 * phase - 1.0))
     z = low + (high - low) * climb
     v_z = (high - low) * climb_rate * 2.0 / duration
 
-    position = jnp.stack([x, z], axis=-1)
-    velocity = jnp.stack([v_x, v_z], axis=-1)
+    position = jnp.concatenate([along, z[:, None]], axis=-1)
+    velocity = jnp.concatenate([along_rate, v_z[:, None]], axis=-1)
     held = state.held[:, None]
     return jnp.where(held, state.held_at, position), jnp.where(held, 0.0, velocity)
 
@@ -182,23 +218,34 @@ def joint_reference(
     # The trunk's own turning moves a point that is fixed in the world by -omega x r.
     drift = drift - body.omega * jnp.stack([-local[:, 1], local[:, 0]], axis=-1)
     q1, q2, trig = inverse(robot, local - robot.hip_pos[:, ::2])
-    J = foot_jacobian(robot, trig)
-    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    safe = jnp.where(jnp.abs(det) > 5e-3, det, jnp.inf)
-    rate1 = (J[:, 1, 1] * drift[:, 0] - J[:, 0, 1] * drift[:, 1]) / safe
-    rate2 = (J[:, 0, 0] * drift[:, 1] - J[:, 1, 0] * drift[:, 0]) / safe
-    rates = jnp.clip(jnp.stack([rate1, rate2], axis=-1), -MAX_JOINT_RATE, MAX_JOINT_RATE)
+    rates = jnp.clip(joint_rates(robot, trig, drift), -MAX_JOINT_RATE, MAX_JOINT_RATE)
     return jnp.stack([q1, q2], axis=-1), rates
+
+
+def spatial_joint_reference(
+    robot: RobotParams,
+    body: spatial.SpatialState,
+    position: Float[Array, "4 3"],
+    velocity: Float[Array, "4 3"],
+) -> tuple[Float[Array, "4 3"], Float[Array, "4 3"]]:
+    """Angles [rad] and rates [rad/s] (4, 3) of all joints for foot references, track frame."""
+    lever = position - body.base
+    omega = spatial.turn(body.heading, body.omega)
+    drift = velocity - body.base_vel - jnp.cross(omega, lever)
+    angle, hip, trig = spatial.inverse(robot, lever @ body.rotation - robot.hip_pos)
+    rates = spatial.joint_rates(robot, hip, trig, drift @ body.rotation)
+    return angle, jnp.clip(rates, -MAX_JOINT_RATE, MAX_JOINT_RATE)
 
 
 def swing_torque(
     params: SwingParams,
     joint_pos: Float[Array, "4 3"],
     joint_vel: Float[Array, "4 3"],
-    position: Float[Array, "4 2"],
-    velocity: Float[Array, "4 2"],
-) -> Float[Array, "4 2"]:
-    """Thigh and calf torque (4, 2) of the joint PD (the paper's swing controller) [N m]."""
-    return params.kp[1:] * (position - joint_pos[:, 1:]) + params.kd[1:] * (
-        velocity - joint_vel[:, 1:]
+    position: Float[Array, "4 n"],
+    velocity: Float[Array, "4 n"],
+) -> Float[Array, "4 n"]:
+    """Torque (4, n) of the joint PD on the last n joints (the paper's swing controller) [N m]."""
+    n = position.shape[1]
+    return params.kp[-n:] * (position - joint_pos[:, -n:]) + params.kd[-n:] * (
+        velocity - joint_vel[:, -n:]
     )

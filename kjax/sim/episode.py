@@ -1,5 +1,6 @@
 """What an episode starts from and what it leaves: initial state, noise, trajectory, metrics."""
 
+import functools
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ import numpy as np
 from kjax import qp
 from kjax.config import CommandConfig, NoiseConfig, PushConfig, RunConfig, TerrainConfig
 from kjax.controller import build_gaits
-from kjax.legs.kinematics import planar_state
+from kjax.legs.base import build_base
 from kjax.robots import go1
-from kjax.sim.observe import NOISE_DIM, Observe, noise_scale
+from kjax.sim import free_base
+from kjax.sim.observe import NOISE_DIM, Observe, noise_dim, noise_scale
 
 FALL_HEIGHT = 0.12  # m, centre of mass; about the trunk lying on the ground
-FALL_PITCH = 1.0  # rad
+FALL_TILT = 1.0  # rad, pitch or roll
 SETTLE_TIME = 0.5  # s; metrics leave out the start from standing
 LATE_TIME = 2.0  # s after the last change of command, for what should be steady by then
 
@@ -30,7 +32,7 @@ class Trajectory:
       qpos: (N, nq) positions of the model.
       qvel: (N, nv) velocities of the model.
       x: (N, 6) true SRB state of the whole-body centre of mass [m, rad, m/s, rad/s].
-      feet: (N, 4, 2) foot centres (x, z), world [m].
+      feet: (N, 4, 2) foot centres (x, z), world, or the plane of a free base's heading [m].
       foot_force: (N, 4) normal force on the contact sensors [N].
       torque: (N, 4, 3) joint torques commanded (abduction, thigh, calf) [N m].
       gait: (N,) index of the gait, order of ``controller.build_gaits``.
@@ -107,10 +109,10 @@ def fixed_part(config: RunConfig) -> RunConfig:
 
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
-    """Qpos and qvel of the planar robot, standing, disturbed as the config and its seed say."""
+    """Qpos and qvel of the robot, standing, disturbed as the config and its seed say."""
     bounding = config.gait.names[0] == "bound"
     height, joints = go1.stand_pose(config.bound.height if bounding else config.lmpc.height)
-    qpos, qvel = np.zeros(nq), np.zeros(nv)
+    qpos, qvel = np.zeros(15), np.zeros(15)
     qpos[1], qpos[3:] = height, joints.reshape(-1)
     spread, noise = config.noise, np.random.default_rng([config.seed, 0])
     if spread.enabled:
@@ -120,46 +122,60 @@ def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.n
         qpos[1] += abs(np.sin(pitch)) * go1.PARAMS.hip_pos[0, 0]
         qvel[:2] = spread.initial_velocity * noise.standard_normal(2)
         qvel[2] = -spread.initial_pitch_rate * noise.standard_normal()
+    if config.sim.base == "free":
+        qpos, qvel = free_base.from_planar(qpos, qvel)
+    if (len(qpos), len(qvel)) != (nq, nv):
+        raise ValueError(f"sim.base = '{config.sim.base}' has no model of nq {nq} and nv {nv}")
     return qpos, qvel
 
 
 def sensor_noise(config: RunConfig, steps: int, start: int = 0) -> np.ndarray:
-    """Noise (steps, 30) of an episode from step ``start`` on.
+    """Noise (steps, n) of an episode from step ``start`` on; n is 30, or 36 for a free base.
 
     The noise of a step depends on the seed and the step's number only, so that episodes may be
     drawn in pieces and are the same on every engine.
     """
-    scale = noise_scale(config.noise)
+    scale = noise_scale(config.noise, config.sim.base)
     if not scale.any():
-        return np.zeros((steps, NOISE_DIM))
-    key = jax.random.fold_in(jax.random.key(config.seed), 1)
-    return np.asarray(_normals(key, np.arange(start, start + steps)), float) * scale
+        return np.zeros((steps, len(scale)))
+    numbers = np.arange(start, start + steps)
+    streams = [(1, NOISE_DIM)]
+    if config.sim.base == "free":
+        streams.append((2, noise_dim("free") - NOISE_DIM))  # its own: the rest is the planar one's
+    key = jax.random.key(config.seed)
+    drawn = [_normals(jax.random.fold_in(key, name), numbers, n) for name, n in streams]
+    return np.concatenate([np.asarray(part, float) for part in drawn], axis=1) * scale
 
 
-@jax.jit
-def _normals(key: jax.Array, steps: jax.Array) -> jax.Array:
-    """Standard normal vectors (steps, 30), one stream per step."""
+@functools.partial(jax.jit, static_argnums=2)
+def _normals(key: jax.Array, steps: jax.Array, size: int) -> jax.Array:
+    """Standard normal vectors (steps, size), one stream per step."""
 
     def one(step: jax.Array) -> jax.Array:
-        return jax.random.normal(jax.random.fold_in(key, step), (NOISE_DIM,), jnp.float32)
+        return jax.random.normal(jax.random.fold_in(key, step), (size,), jnp.float32)
 
     return jax.vmap(one)(steps)
 
 
 def sagittal(observe: Observe, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """True SRB states (N, 6) and feet (N, 4, 2) along a trajectory, without noise."""
+    """True SRB states (N, 6) and feet (N, 4, 2) along a trajectory, without noise.
+
+    Of a free base: in the plane of its heading, with the progress along the heading at the start.
+    """
+    base = build_base("free" if free_base.is_free(qpos) else "planar")
+    track = base.track(observe(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]), jnp.zeros(64)))
 
     def one(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        body = planar_state(go1.PARAMS, observe(qpos, qvel, jnp.zeros(64)))
+        body = base.view(go1.PARAMS, track, observe(qpos, qvel, jnp.zeros(64))).planar
         return body.x, body.feet
 
     x, feet = jax.jit(jax.vmap(one))(qpos, qvel)
     return np.asarray(x), np.asarray(feet)
 
 
-def fallen(height: float, pitch: float) -> bool:
-    """Whether a centre-of-mass height [m] and a pitch [rad] mean a fall; NaN does."""
-    return not (height > FALL_HEIGHT and abs(pitch) < FALL_PITCH)
+def fallen(height: float, pitch: float, roll: float = 0.0) -> bool:
+    """Whether a centre-of-mass height [m], pitch and roll [rad] mean a fall; NaN does."""
+    return not (height > FALL_HEIGHT and abs(pitch) < FALL_TILT and abs(roll) < FALL_TILT)
 
 
 def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
@@ -191,6 +207,7 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         **_tracking(run, config),
         **_crossing(run, config),
         **_switching(run, config),
+        **free_base.metrics(run.qpos, steady),
         "foot_slip_m": foot_slip(run, config.sim.sim_dt, config.sim.contact_threshold),
         "torque_max_nm": float(np.abs(run.torque).max()),
         "torque_saturation_fraction": float(saturated.any(axis=(1, 2)).mean()),
@@ -279,9 +296,12 @@ def foot_slip(run: Trajectory, dt: float, threshold: float) -> float:
     The foot is a sphere: while the calf turns, its centre moves without slip. What counts is the
     velocity of the material point at the bottom, v_centre - (d angle / dt) * radius.
     """
-    joints = run.qpos[:, 3:].reshape(-1, 4, 3)
-    angle = run.qpos[:, 2, None] + joints[:, :, 1] + joints[:, :, 2]  # of the calf, about +y
-    slide = np.diff(run.feet[:, :, 0], axis=0) - go1.FOOT_RADIUS * np.diff(angle, axis=0)
+    if free_base.is_free(run.qpos):
+        slide = dt * free_base.sliding_speed(run.qpos, run.qvel)[:-1]
+    else:
+        joints = run.qpos[:, 3:].reshape(-1, 4, 3)
+        angle = run.qpos[:, 2, None] + joints[:, :, 1] + joints[:, :, 2]  # of the calf, about +y
+        slide = np.diff(run.feet[:, :, 0], axis=0) - go1.FOOT_RADIUS * np.diff(angle, axis=0)
     touching = run.foot_force > threshold
     pressed = touching[:-1] & touching[1:]
     stances = np.sum(np.diff(run.stance.astype(int), axis=0) > 0) + run.stance[0].sum()

@@ -42,7 +42,7 @@ class MjxSimulation(NamedTuple):
     Attributes:
       model: the C model that MJX's was made from.
       reset: (qpos, qvel) -> data, kinematics and sensors evaluated.
-      run: (params, controller state, data, noise (T, S, 30)) -> (state, data, log).
+      run: (params, controller state, data, noise (T, S, 30 or 36)) -> (state, data, log).
     """
 
     model: mujoco.MjModel

@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from kjax.config import ConfigError, RunConfig
+from kjax.config import RunConfig
 from kjax.controller import (
     Controller,
     ControllerParams,
@@ -23,7 +23,7 @@ from kjax.controller import (
     build_params,
 )
 from kjax.robots import go1
-from kjax.sim import terrain
+from kjax.sim import free_base, terrain
 from kjax.sim.episode import (
     Trajectory,
     fallen,
@@ -32,7 +32,7 @@ from kjax.sim.episode import (
     sagittal,
     sensor_noise,
 )
-from kjax.sim.observe import NOISE_DIM, Addresses, Observe, add_noise, build_observe, resolve
+from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, noise_dim, resolve
 from kjax.sim.push import push_force, pushed_body
 from kjax.sim.scene import build_model
 from kjax.types import Command, Leg, Observation
@@ -121,13 +121,7 @@ class Simulation(NamedTuple):
 
 
 def build_simulation(config: RunConfig) -> Simulation:
-    """Model, controller and compiled calls for a config.
-
-    Raises:
-      ConfigError: for a base that the controller cannot walk.
-    """
-    if config.sim.base != "planar":
-        raise ConfigError(f"sim.base: got '{config.sim.base}', the controller walks 'planar' only")
+    """Model, controller and compiled calls for a config."""
     model = build_model(config.sim, config.terrain)
     observe = build_observe(model, config.sim.contact_threshold)
     controller, params = build_controller(config), build_params(config, go1.PARAMS)
@@ -185,7 +179,7 @@ def build_simulation(config: RunConfig) -> Simulation:
         return pack(loop._replace(controller=state)), torque.reshape(-1)
 
     dtype = params.position_slack.dtype
-    example = jax.ShapeDtypeStruct((cuts[-1] + NOISE_DIM,), dtype)
+    example = jax.ShapeDtypeStruct((cuts[-1] + noise_dim(config.sim.base),), dtype)
     default = requests(config)
     state_like = jax.eval_shape(begin, example, default)
     jitted_init = jax.jit(init)
@@ -278,7 +272,7 @@ def simulate(
     # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
     piece = _NOISE_TICKS * per_tick
     noise = sensor_noise(config, piece)
-    sensed = np.zeros(model.nq + model.nv + model.nsensordata + NOISE_DIM)
+    sensed = np.zeros(model.nq + model.nv + model.nsensordata + noise.shape[1])
     cuts = np.cumsum([model.nq, model.nv, model.nsensordata])
 
     def sense(step: int) -> np.ndarray:
@@ -326,7 +320,8 @@ def simulate(
                 mujoco.mj_step(model, data)
                 done = i + 1
             body_contact[tick] = not is_foot_or_world[data.contact.geom].all()
-            if fallen(data.subtree_com[trunk, 2], data.qpos[2]):
+            roll, pitch, _ = free_base.attitude(data.qpos)
+            if fallen(data.subtree_com[trunk, 2], pitch, roll):
                 fell = True
                 break
             if on_tick is not None:

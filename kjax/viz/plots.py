@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 
 from kjax.config import RunConfig
 from kjax.robots.go1 import JOINTS
+from kjax.sim import free_base
 from kjax.sim.episode import Trajectory
 from kjax.sim.series import Series
 from kjax.types import Leg
@@ -53,8 +54,15 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         velocity.legend(ncol=3, loc="upper left")
         velocity.set_title(title, loc="left", fontsize=9)
 
-        pitch.plot(t, np.degrees(run.x[:, 2]), color=BLUE)
+        if free_base.is_free(run.qpos):
+            roll, _, yaw = free_base.attitude(run.qpos)
+            pitch.plot(t, np.degrees(roll), color=RED, label="roll")
+            pitch.plot(t, np.degrees(np.unwrap(yaw) - yaw[0]), color=GREY, label="yaw")
+        pitch.plot(t, np.degrees(run.x[:, 2]), color=BLUE, label="pitch")
         pitch.set_ylabel("pitch [deg]\nnose up +")
+        if free_base.is_free(run.qpos):
+            pitch.set_ylabel("angles [deg]")
+            pitch.legend(ncol=3, loc="upper left")
 
         height.plot(t, run.x[:, 1], color=BLUE)
         height.axhline(config.lmpc.height, ls="--", color=DARK, lw=0.9)

@@ -17,6 +17,7 @@ from PIL import Image, ImageDraw
 
 from kjax.config import RunConfig, load_config
 from kjax.robots import go1
+from kjax.sim import free_base
 from kjax.sim.episode import Trajectory
 from kjax.types import Leg
 
@@ -98,17 +99,21 @@ def stick_video(run: Trajectory, path: Path) -> None:
 
 
 def _sticks(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Trunk ends (2, 2) and hip, knee, foot of each leg (4, 3, 2), world (x, z) [m]."""
-    turn = qpos[2]  # MuJoCo's angle about +y
-    rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    """Trunk ends (2, 2) and hip, knee, foot of each leg (4, 3, 2), world (x, z) [m].
+
+    Roll, yaw and abduction of a free robot are left out.
+    """
+    _, pitch, _ = free_base.attitude(qpos)
+    rotation = np.array([[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]])
+    origin = qpos[:3:2] if free_base.is_free(qpos) else qpos[:2]
     hips = np.asarray(go1.PARAMS.hip_pos)[:, ::2]
-    joints = qpos[3:].reshape(4, 3)
+    joints = free_base.joints(qpos)
     down = -np.stack([np.sin(joints[:, 1]), np.cos(joints[:, 1])], axis=-1)
     total = joints[:, 1] + joints[:, 2]
     knees = hips + go1.THIGH_LENGTH * down
     feet = knees - go1.CALF_LENGTH * np.stack([np.sin(total), np.cos(total)], axis=-1)
-    legs = np.stack([hips, knees, feet], axis=1) @ rotation.T + qpos[:2]
-    trunk = np.array([[0.24, 0.0], [-0.22, 0.0]]) @ rotation.T + qpos[:2]
+    legs = np.stack([hips, knees, feet], axis=1) @ rotation.T + origin
+    trunk = np.array([[0.24, 0.0], [-0.22, 0.0]]) @ rotation.T + origin
     return trunk, legs
 
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from kjax.config import ConfigError, RunConfig, load_config
+from kjax.config import RunConfig, load_config
 from kjax.robots import go1
 from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics, sensor_noise
 from kjax.sim.mujoco_loop import build_simulation, simulate
@@ -93,11 +93,6 @@ def test_a_fall_ends_the_run_and_is_reported(simulation):
     result = metrics(run, simulation.config)
     assert result["fell"]
     assert 0.2 < result["fall_time_s"] < 1.5
-
-
-def test_a_base_without_a_controller_is_refused():
-    with pytest.raises(ConfigError, match=r"sim\.base"):
-        build_simulation(load_config(RunConfig, None, {"sim.base": "free"}))
 
 
 def test_fallen_includes_nan():

@@ -1,0 +1,221 @@
+"""The free robot in C MuJoCo and on MJX: start, noise, metrics, a short walk, a shove."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from kjax.config import RunConfig, load_config
+from kjax.robots import go1
+from kjax.sim import free_base, mjx_loop
+from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics, sensor_noise
+from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.observe import FREE_NOISE_DIM, add_noise, build_observe
+
+FREE = {"sim.base": "free", "sim.contacts": "feet"}
+PER_TICK, TICKS = 5, 60
+
+
+@pytest.fixture(scope="module")
+def config():
+    walk = {"duration": 1.5, "command.times": [0.0, 0.5], "command.velocities": [0.0, 0.2]}
+    return load_config(RunConfig, None, FREE | walk)
+
+
+@pytest.fixture(scope="module")
+def simulation(config):
+    return build_simulation(config)
+
+
+@pytest.fixture(scope="module")
+def model(simulation):
+    return simulation.model
+
+
+def moved(model, seed):
+    """Random posture and motion, everything derived."""
+    rng = np.random.default_rng(seed)
+    data = mujoco.MjData(model)
+    data.qpos[:3] = [0.3, -0.2, 0.4]
+    mujoco.mju_euler2Quat(data.qpos[3:7], rng.uniform(-0.5, 0.5, 3), "zyx")
+    data.qpos[7:] = (go1.stand_pose(0.27)[1] + 0.3 * rng.standard_normal((4, 3))).reshape(-1)
+    data.qvel[:] = rng.standard_normal(18)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_it_starts_in_the_planar_robot_s_state(config, model):
+    qpos, qvel = initial_state(config, 19, 18)
+    planar = dataclasses.replace(config, sim=dataclasses.replace(config.sim, base="planar"))
+    flat, flat_vel = initial_state(planar, 15, 15)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    roll, pitch, yaw = free_base.attitude(qpos)
+    assert (float(roll), float(yaw)) == (0.0, 0.0)
+    assert float(pitch) == pytest.approx(-flat[2], abs=1e-12)
+    np.testing.assert_array_equal(data.body("trunk").xpos, [flat[0], 0.0, flat[1]])
+    np.testing.assert_array_equal(qvel[[0, 2, 4]], flat_vel[:3])
+    feet = [data.geom(f"{leg}_foot").xpos[2] for leg in ("FR", "FL", "RR", "RL")]
+    # The lower pair stands on the ground, as on the planar base.
+    assert min(feet) == pytest.approx(go1.FOOT_RADIUS, abs=0.002)
+    with pytest.raises(ValueError, match="nq 15"):
+        initial_state(config, 15, 15)
+
+
+def test_the_attitude_is_mujocos(model):
+    for seed in range(5):
+        data = moved(model, seed)
+        R = data.body("trunk").xmat.reshape(3, 3)
+        roll, pitch, yaw = free_base.attitude(data.qpos)
+        # Roll, then pitch about the old y, then yaw: Rz Ry Rx.
+        quat, again = np.zeros(4), np.zeros(9)
+        mujoco.mju_euler2Quat(quat, np.array([yaw, -pitch, roll]), "zyx")
+        mujoco.mju_quat2Mat(again, quat)
+        np.testing.assert_allclose(again.reshape(3, 3), R, atol=1e-12)
+    assert free_base.attitude(np.array([[1.0, 0.3, -0.2] + [0.0] * 12]))[1] == [0.2]
+
+
+def test_the_sole_slides_at_mujocos_speed_of_that_point(model):
+    for seed in range(3):
+        data = moved(model, seed)
+        ours = free_base.sliding_speed(data.qpos[None], data.qvel[None])[0]
+        for leg, name in enumerate(("FR", "FL", "RR", "RL")):
+            sole = data.geom(f"{name}_foot").xpos - [0.0, 0.0, go1.FOOT_RADIUS]
+            J = np.zeros((3, model.nv))
+            mujoco.mj_jac(model, data, J, None, sole, model.body(f"{name}_calf").id)
+            assert ours[leg] == pytest.approx(np.hypot(*(J @ data.qvel)[:2]), abs=1e-12)
+
+
+def test_noise_of_the_trunk_is_three_dimensional(model):
+    observe = build_observe(model, 5.0)
+    data = moved(model, 0)
+    clean = observe(*(jnp.asarray(a) for a in (data.qpos, data.qvel, data.sensordata)))
+    same = add_noise(clean, jnp.zeros(FREE_NOISE_DIM))
+    for a, b in zip(clean, same, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-15)
+    noisy = add_noise(clean, jnp.arange(1, FREE_NOISE_DIM + 1) * 1e-3)
+    np.testing.assert_allclose(noisy.base_pos - clean.base_pos, [1e-3, 31e-3, 2e-3], atol=1e-12)
+    np.testing.assert_allclose(noisy.base_vel - clean.base_vel, [4e-3, 34e-3, 5e-3], atol=1e-12)
+    rates = noisy.base_ang_vel - clean.base_ang_vel
+    np.testing.assert_allclose(rates, [35e-3, -6e-3, 36e-3], atol=1e-12)
+    turn, back = np.zeros(3), np.zeros(4)
+    mujoco.mju_negQuat(back, np.asarray(clean.base_quat))
+    mujoco.mju_mulQuat(back, back, np.asarray(noisy.base_quat))
+    mujoco.mju_quat2Vel(turn, back, 1.0)
+    # A first-order turn by 46 mrad is right to its cube over 12.
+    np.testing.assert_allclose(turn, [32e-3, -3e-3, 33e-3], atol=1e-5)
+    assert np.linalg.norm(noisy.base_quat) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_sagittal_noise_is_the_planar_robot_s(config):
+    planar = dataclasses.replace(config, sim=dataclasses.replace(config.sim, base="planar"))
+    noise = sensor_noise(config, 2000)
+    assert noise.shape == (2000, FREE_NOISE_DIM)
+    np.testing.assert_array_equal(noise[:, :30], sensor_noise(planar, 2000))
+    scale = [0.001, 0.003, 0.003, 0.02, 0.05, 0.05]
+    # 6 %: four standard errors of a standard deviation of 2000 samples
+    np.testing.assert_allclose(noise[:, 30:].std(axis=0), scale, rtol=0.06)
+    assert np.abs(np.corrcoef(noise.T) - np.eye(FREE_NOISE_DIM)).max() < 0.1
+
+
+def test_a_roll_is_a_fall():
+    assert fallen(0.27, 0.0, 1.1)
+    assert fallen(0.27, 0.0, np.nan)
+    assert not fallen(0.27, 0.1, -0.9)
+
+
+def test_metrics_measure_yaw_and_drift_from_the_first_heading():
+    steps, first = 3, 3.0  # rad; the yaw passes pi
+    qpos = np.zeros((steps, 19))
+    for i, (roll, yaw) in enumerate(((0.0, 0.0), (0.02, 0.2), (-0.1, -0.1))):
+        mujoco.mju_euler2Quat(qpos[i, 3:7], np.array([first + yaw, 0.0, roll]), "zyx")
+    ahead, left = (
+        np.array([np.cos(first), np.sin(first)]),
+        np.array([-np.sin(first), np.cos(first)]),
+    )
+    qpos[:, :2] = [np.zeros(2), ahead + 0.3 * left, 2 * ahead - 0.1 * left]
+    qpos[:, :2] += [5.0, -3.0]
+    result = free_base.metrics(qpos, np.ones(steps, bool))
+    assert result["roll_max_deg"] == pytest.approx(np.degrees(0.1))
+    assert result["yaw_max_deg"] == pytest.approx(np.degrees(0.2))
+    assert result["lateral_drift_m"] == pytest.approx(0.3)
+    assert free_base.metrics(np.zeros((steps, 15)), np.ones(steps, bool)) == {}
+
+
+@pytest.fixture(scope="module")
+def shoved(simulation):
+    """A trot that gets 0.3 m/s to the left at 0.4 s."""
+
+    def push(done, total, data):
+        if done == 400:
+            data.qvel[1] += 0.3
+
+    return simulate(simulation, seed=0, on_tick=push)
+
+
+def test_it_trots_at_the_commanded_speed_and_takes_a_shove(shoved, simulation):
+    result = metrics(shoved, simulation.config)
+    assert not result["fell"]
+    assert result["qp_unsolved"] == 0
+    assert np.mean(shoved.x[-500:, 3]) == pytest.approx(0.2, abs=0.03)
+    sideways = shoved.qvel[:, 1]
+    assert sideways[405:420].max() > 0.25
+    # Half of it is left after 12.7 kg / (30 N s/m) ln 2 = 0.3 s by the regulator alone.
+    assert abs(sideways[-300:].mean()) < 0.05
+    roll, pitch, yaw = (np.degrees(a) for a in free_base.attitude(shoved.qpos))
+    assert 1.0 < np.abs(roll).max() < 12.0
+    assert np.abs(roll[-200:]).max() < 4.0
+    assert np.abs(yaw).max() < 10.0
+    assert np.abs(pitch).max() < 5.0
+
+
+def test_its_feet_plant_and_contacts_follow_the_schedule(shoved, config):
+    late = shoved.time > 0.3
+    agreement = (shoved.foot_force[late] > 5.0) == shoved.stance[late]
+    # touchdown is a few ms early or late in each phase of 250 ms; the shove costs some more
+    assert agreement.mean() > 0.93
+    assert 0.0 < foot_slip(shoved, config.sim.sim_dt, 5.0) < 0.01
+
+
+def test_the_same_drag_is_the_same_slip_on_both_bases():
+    """A foot dragged straight ahead, legs still: its path."""
+    steps = 101
+    run = {f.name: np.zeros(0) for f in dataclasses.fields(Trajectory)}
+    force, stance = np.zeros((steps, 4)), np.zeros((steps, 4), bool)
+    force[:, 0], stance[:, 0] = 50.0, True
+    run |= {"foot_force": force, "stance": stance}
+    qpos, qvel = np.zeros((steps, 19)), np.zeros((steps, 18))
+    qpos[:, 3], qvel[:, 0] = 1.0, 0.1
+    assert foot_slip(Trajectory(**run | {"qpos": qpos, "qvel": qvel}), 1e-3, 5.0) == pytest.approx(
+        0.01, abs=1e-12
+    )
+
+
+@pytest.mark.slow
+def test_three_tenths_of_a_second_on_mjx_agree_with_c(simulation, config):
+    device = mjx_loop.build_mjx(config, simulation.controller)
+    noise = sensor_noise(config, TICKS * PER_TICK)
+
+    @jax.jit
+    def run(qpos, qvel, noise):
+        data = device.reset(qpos, qvel)
+        seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
+        state = simulation.controller.init(simulation.params, add_noise(seen, noise[0, 0]))
+        return device.run(simulation.params, state, data, noise)
+
+    start = initial_state(config, device.model.nq, device.model.nv)
+    _, _, log = run(*start, noise.reshape(TICKS, PER_TICK, -1))
+
+    def stop(done, total, data):
+        if done >= TICKS * PER_TICK:
+            raise KeyboardInterrupt
+
+    in_c = simulate(simulation._replace(model=device.model), on_tick=stop)
+    assert (log.info.status == 0).all()
+    # 1e-7: equal algorithms in double precision; contacts amplify the order of sums.
+    np.testing.assert_allclose(log.qpos.reshape(-1, 19), in_c.qpos, atol=1e-7)
+    np.testing.assert_allclose(log.torque.reshape(-1, 4, 3), in_c.torque, atol=1e-3)

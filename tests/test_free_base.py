@@ -1,0 +1,190 @@
+"""The controller on the free base: what it may not depend on, where it equals the planar one."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from kjax import Observation, build_controller, build_params, load_config, qp
+from kjax.config import RunConfig
+from kjax.robots import go1
+from kjax.types import Leg
+
+PLANAR = load_config(RunConfig, None, {})
+FREE = load_config(RunConfig, None, {"sim.base": "free"})
+
+
+@pytest.fixture(scope="module")
+def params():
+    return build_params(FREE, go1.PARAMS)
+
+
+@pytest.fixture(scope="module")
+def free():
+    return compiled(FREE)
+
+
+def compiled(config):
+    controller = build_controller(config)
+    return controller._replace(
+        init=jax.jit(controller.init), plan=jax.jit(controller.plan), act=jax.jit(controller.act)
+    )
+
+
+def disturbed(seed, *, planar=False, scale=1.0, dtype=float):
+    """The standing robot, moving and tilted a little; in the sagittal plane only if ``planar``."""
+    rng = np.random.default_rng(seed)
+    height, joints = go1.stand_pose(0.27)
+    keep = np.array([0.0, 1.0, 0.0]) if planar else np.ones(3)
+    slide = np.array([1.0, 0.0, 1.0]) if planar else np.ones(3)
+    quat, turns = np.zeros(4), 0.1 * scale * rng.normal(size=3) * keep
+    mujoco.mju_euler2Quat(quat, turns[::-1].copy(), "zyx")
+    loose = np.array([0.0, 1.0, 1.0]) if planar else np.ones(3)
+    values = {
+        "base_pos": np.array([0.0, 0.0, height]) + 0.02 * scale * rng.normal(size=3) * slide,
+        "base_quat": quat,
+        "base_vel": 0.1 * scale * rng.normal(size=3) * slide,
+        "base_ang_vel": 0.5 * scale * rng.normal(size=3) * keep,
+        "joint_pos": joints + 0.05 * scale * rng.normal(size=(4, 3)) * loose,
+        "joint_vel": 0.3 * scale * rng.normal(size=(4, 3)) * loose,
+    }
+    arrays = {name: jnp.asarray(value, dtype) for name, value in values.items()}
+    return Observation(**arrays, contact=jnp.asarray([True, False, False, True]))
+
+
+def seen_from(observation, yaw, shift):
+    """The same robot somewhere else, looking elsewhere."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    quat = np.zeros(4)
+    half = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+    mujoco.mju_mulQuat(quat, half, np.asarray(observation.base_quat, float))
+    return observation._replace(
+        base_pos=jnp.asarray(turn @ observation.base_pos + np.array([*shift, 0.0])),
+        base_quat=jnp.asarray(quat),
+        base_vel=jnp.asarray(turn @ observation.base_vel),
+    )
+
+
+def torques(controller, params, observations, ticks=3):
+    """Torques of a short history: one plan and one act for each observation."""
+    state = controller.init(params, observations[0])
+    out = []
+    for observation in observations[:ticks]:
+        state, info = controller.plan(params, state, observation)
+        assert int(info.status) == qp.Status.SOLVED
+        state, torque = controller.act(params, state, observation)
+        out.append(np.asarray(torque))
+    return np.stack(out), state
+
+
+@pytest.mark.parametrize(("yaw", "shift"), [(0.0, (3.0, -2.0)), (1.0, (0, 0)), (-2.8, (-1.0, 4.0))])
+def test_neither_place_nor_heading_at_the_start_matters(free, params, yaw, shift):
+    history = [disturbed(seed) for seed in range(3)]
+    ours, _ = torques(free, params, history)
+    theirs, _ = torques(free, params, [seen_from(o, yaw, shift) for o in history])
+    assert np.abs(ours).max() > 5.0
+    # The QP is solved to 1e-6 of its gradient, which grows with p_x: 4e-3 N m at 3 m.
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=0.02)
+
+
+def test_a_turn_after_the_start_is_turned_back(free, params):
+    """Yawed to the left, then to the right: the moment of the stance feet on the trunk opposes."""
+    level = disturbed(0, planar=True)._replace(base_ang_vel=jnp.zeros(3), contact=jnp.ones(4, bool))
+    for turned in (0.1, -0.1):
+        state = free.init(params, level)
+        state, _ = free.plan(params, state, level)
+        there = seen_from(level, turned, (0.0, 0.0))
+        _, torque = free.act(params, state, there)
+        _, straight = free.act(params, state, level)
+        moment = yaw_moment(there, torque, state.stance) - yaw_moment(level, straight, state.stance)
+        # -20 N m/rad on 0.1 rad; two feet on a line give it but for the forces' own weight.
+        assert moment == pytest.approx(-20.0 * turned, abs=0.4)
+
+
+def yaw_moment(observation, torque, stance):
+    """Moment of the stance feet about the vertical through the trunk, by MuJoCo's Jacobians."""
+    spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
+    spec.body("trunk").add_freejoint(name="root")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qpos[3:7] = observation.base_pos, observation.base_quat
+    data.qpos[7:] = np.asarray(observation.joint_pos).reshape(-1)
+    mujoco.mj_forward(model, data)
+    total = 0.0
+    for leg in np.flatnonzero(stance):
+        J = np.zeros((3, model.nv))
+        foot = model.geom(f"{Leg(leg).name}_foot").id
+        mujoco.mj_jacGeom(model, data, J, None, foot)
+        force = -np.linalg.solve(J[:, 6 + 3 * leg : 9 + 3 * leg].T, np.asarray(torque)[leg])
+        arm = data.geom_xpos[foot] - data.subtree_com[model.body("trunk").id]
+        total += arm[0] * force[1] - arm[1] * force[0]
+    return total
+
+
+def test_without_a_regulator_a_planar_state_gives_the_planar_controller_s_torques(free, params):
+    inactive = params._replace(
+        lateral=params.lateral._replace(weights=jnp.zeros(6), friction_x=jnp.full(3, jnp.inf))
+    )
+    history = [disturbed(seed, planar=True, scale=0.05) for seed in range(3)]
+    # Where the paper's R on absolute forces balances the weight.
+    sink = jnp.array([0.0, 0.0, -0.014])
+    history = [seen._replace(base_pos=seen.base_pos + sink) for seen in history]
+    ours, state = torques(free, inactive, history)
+    assert (np.asarray(state.force)[[0, 3], 1] > 10.0).all()  # feet that need not pull
+    theirs, flat = torques(compiled(PLANAR), params, history)
+    # Thigh and calf everywhere; abduction where the leg swings: in stance the planar robot's is
+    # held, the free one's carries its share.  Rounding times gains, and the QP's tolerance.
+    np.testing.assert_allclose(ours[..., 1:], theirs[..., 1:], rtol=0, atol=1e-3)
+    swinging = ~np.asarray(state.stance)
+    assert swinging.tolist() == [False, True, True, False]
+    np.testing.assert_allclose(ours[:, swinging], theirs[:, swinging], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(state.force, flat.force, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_state_keeps_its_tree_shapes_and_types(dtype):
+    controller = build_controller(FREE)
+    params = build_params(FREE, go1.PARAMS, dtype=dtype)
+    observation = disturbed(0, dtype=dtype)
+    state = jax.eval_shape(controller.init, params, observation)
+    planned, _ = jax.eval_shape(controller.plan, params, state, observation)
+    acted, torque = jax.eval_shape(controller.act, params, planned, observation)
+    chex.assert_trees_all_equal_shapes_and_dtypes(state, planned, acted)
+    assert torque.dtype == dtype
+    assert state.swing.lift_off.shape == (4, 3)
+
+
+def test_single_precision_agrees_with_double(free, params):
+    single = build_params(FREE, go1.PARAMS, dtype=jnp.float32)
+    double, _ = torques(free, params, [disturbed(1)])
+    # Far from the origin float32 resolves 2e-7 m of a place, times 3e4 N/m of gain: 0.02 N.
+    half, _ = torques(free, single, [disturbed(1, dtype=jnp.float32)])
+    assert half.dtype == np.float32
+    np.testing.assert_allclose(half, double, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("field", ["base_quat", "joint_vel"])
+def test_a_non_finite_observation_is_reported_and_spreads_nowhere(free, params, field):
+    good = disturbed(0)
+    state, _ = free.plan(params, free.init(params, good), good)
+    values = getattr(good, field)
+    broken = good._replace(**{field: jnp.full_like(values, jnp.nan)})
+    state, info = free.plan(params, state, broken)
+    assert int(info.status) == qp.Status.NON_FINITE
+    state, torque = free.act(params, state, broken)
+    np.testing.assert_array_equal(torque, 0.0)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
+    state, info = free.plan(params, state, good)
+    assert int(info.status) == qp.Status.SOLVED
+
+
+def test_a_heading_that_was_never_read_is_reported_at_every_tick(free, params):
+    good = disturbed(0)
+    state = free.init(params, good._replace(base_quat=jnp.full(4, jnp.nan)))
+    state, info = free.plan(params, state, good)
+    assert int(info.status) == qp.Status.NON_FINITE
+    _, torque = free.act(params, state, good)
+    np.testing.assert_array_equal(torque, 0.0)
