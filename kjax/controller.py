@@ -213,7 +213,8 @@ def build_controller(config: RunConfig) -> Controller:
         swings = swing.begin_swings(
             state.swing, lifting | anew, view.feet, gait.time_to_touchdown(schedule, clock)
         )
-        swings = swings._replace(held=swings.held & ~stance)
+        cut = stance & ~state.stance & (clock.gait != state.clock.gait)
+        swings = swing.end_swings(params.swing, swings, stance, cut, observation.contact, view.feet)
 
         command = params.command.velocities[_piece(params.command.times, state.time)]
         change = params.command_slew * lmpc.control_dt
@@ -372,7 +373,7 @@ def build_controller(config: RunConfig) -> Controller:
             sim_dt,
         )
         command = LegCommand(
-            stance=state.stance,
+            stance=state.stance & ~swings.reaching,
             force=state.force,
             swing=swings,
             stance_time=params.schedule.stance_time[where],
@@ -438,6 +439,7 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
                 offset=jnp.asarray(is_bound[:, None] * _bound_offset(robot, config)),
                 horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
                 hold_after=jnp.asarray(leg.hold_after),
+                reach_speed=jnp.asarray(leg.reach_speed),
                 kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
                 kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
             ),

@@ -22,6 +22,8 @@ class SwingParams(NamedTuple):
       offset: (4,) foothold ahead of the hip when standing still, likewise by gait [m].
       horizontal_fraction: part of the swing after which the foot is above its foothold [-].
       hold_after: part of the swing after which a contact means an obstacle [-].
+      reach_speed: at which a foot feels for the ground when a change of gait has cut its swing
+        short; 0: its leg presses at once [m/s].
       kp: joint stiffness of (abduction, thigh, calf) [N m/rad].
       kd: joint damping of the same [N m s/rad].
     """
@@ -31,6 +33,7 @@ class SwingParams(NamedTuple):
     offset: Float[Array, "*gait 4"]
     horizontal_fraction: Float[Array, ""]
     hold_after: Float[Array, ""]
+    reach_speed: Float[Array, ""]
     kp: Float[Array, "3"]
     kd: Float[Array, "3"]
 
@@ -53,7 +56,8 @@ class SwingState(NamedTuple):
       elapsed: (4,) time since then [s].
       duration: (4,) planned length of the swing [s].
       held: (4,) whether an early contact stopped the foot.
-      held_at: (4, d) where it did, likewise [m].
+      held_at: (4, d) where it did, or where a reaching foot shall be, likewise [m].
+      reaching: (4,) whether the leg is due to stand but has not found the ground yet.
     """
 
     lift_off: Float[Array, "4 d"]
@@ -61,13 +65,20 @@ class SwingState(NamedTuple):
     duration: Float[Array, "4"]
     held: Bool[Array, "4"]
     held_at: Float[Array, "4 d"]
+    reaching: Bool[Array, "4"]
 
 
 def initial_swing(feet: Float[Array, "4 d"]) -> SwingState:
     """State before the first swing, feet (4, d) in the world [m]."""
     zeros = jnp.zeros((4,), feet.dtype)
+    none = jnp.zeros((4,), bool)
     return SwingState(
-        lift_off=feet, elapsed=zeros, duration=zeros + 1.0, held=zeros > 1.0, held_at=feet
+        lift_off=feet,
+        elapsed=zeros,
+        duration=zeros + 1.0,
+        held=none,
+        held_at=feet,
+        reaching=none,
     )
 
 
@@ -84,6 +95,29 @@ def begin_swings(
         duration=jnp.where(lifting, duration, state.duration),
         held=state.held & ~lifting,
         held_at=state.held_at,
+        reaching=state.reaching & ~lifting,
+    )
+
+
+def end_swings(
+    params: SwingParams,
+    state: SwingState,
+    stance: Bool[Array, "4"],
+    cut: Bool[Array, "4"],
+    contact: Bool[Array, "4"],
+    feet: Float[Array, "4 d"],
+) -> SwingState:
+    """State with the swings of ``stance`` legs over.
+
+    Legs whose swing a change of gait has ``cut`` short are high above the ground. A force has
+    nothing to push against there, and would fling the foot along its direction; so the foot sinks
+    straight down until it touches.
+    """
+    above = cut & ~contact & (params.reach_speed > 0)
+    return state._replace(
+        held=state.held & ~stance,
+        held_at=jnp.where(above[:, None], feet, state.held_at),
+        reaching=(state.reaching | above) & stance,
     )
 
 
@@ -95,14 +129,20 @@ def continue_swings(
     feet: Float[Array, "4 d"],
     dt: float,
 ) -> SwingState:
-    """State ``dt`` [s] later; a foot that hits something late in its swing is held where it is."""
+    """State ``dt`` [s] later; a foot that hits something late in its swing is held where it is.
+
+    A reaching foot sinks, and has arrived with its first contact.
+    """
     elapsed = jnp.where(swinging, state.elapsed + dt, state.elapsed)
     late = elapsed > params.hold_after * state.duration
     caught = swinging & contact & late & ~state.held
+    reaching = state.reaching & ~contact
+    sink = jnp.where(reaching, params.reach_speed * dt, 0.0)
     return state._replace(
         elapsed=elapsed,
         held=state.held | caught,
-        held_at=jnp.where(caught[:, None], feet, state.held_at),
+        held_at=jnp.where(caught[:, None], feet, state.held_at.at[:, -1].add(-sink)),
+        reaching=reaching,
     )
 
 
@@ -197,8 +237,11 @@ def foot_reference(
 
     position = jnp.concatenate([along, z[:, None]], axis=-1)
     velocity = jnp.concatenate([along_rate, v_z[:, None]], axis=-1)
-    held = state.held[:, None]
-    return jnp.where(held, state.held_at, position), jnp.where(held, 0.0, velocity)
+    still = (state.held | state.reaching)[:, None]
+    sink = (
+        jnp.zeros_like(velocity).at[:, -1].set(jnp.where(state.reaching, -params.reach_speed, 0.0))
+    )
+    return jnp.where(still, state.held_at, position), jnp.where(still, sink, velocity)
 
 
 def _smoothstep(s: Array) -> tuple[Array, Array]:
