@@ -226,7 +226,9 @@ def build_controller(config: RunConfig) -> Controller:
         rate, limit = params.integral
         # Errors beyond the limit are a step on its way, not a bias.
         correction = state.correction + rate * lmpc.control_dt * jnp.clip(error, -limit, limit)
-        correction = jnp.clip(correction, -limit, limit)
+        # What one gait's model misses says nothing about another's.
+        same = clock.gait == state.clock.gait
+        correction = jnp.where(same, jnp.clip(correction, -limit, limit), 0.0)
         target = velocity + correction[0]
         lean = jnp.stack([jnp.zeros_like(target), correction[1]] + [jnp.zeros_like(target)] * 2)
         slack = params.position_slack
