@@ -78,7 +78,7 @@ def _parse() -> Namespace:
                         help=f"of: {', '.join(NAMES)}")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=16, help="episodes on flat ground")
     parser.add_argument("--terrains", type=int, default=64, help="episodes on rough ground")
-    parser.add_argument("--base", choices=("planar", "free", "both"), default="planar")
+    parser.add_argument("--base", choices=("planar", "free", "both"), default="both")
     parser.add_argument("--jobs", type=int, default=2, help="worker processes, one core each")
     parser.add_argument("--quick", action="store_true",
                         help="2 episodes of 1.5 s each: to check the script")  # fmt: skip

@@ -317,7 +317,7 @@ class LegConfig:
     """Part of the swing after which the foot has arrived above its foothold [-]."""
     velocity_gain: NonNegative = 0.03
     """Raibert gain on the velocity error in the foothold [s]."""
-    reach_speed: NonNegative = 0.7
+    reach_speed: NonNegative = 1.0
     """Speed at which a foot feels for the ground when a change of gait has cut its swing short;
     0: its leg presses at once [m/s]."""
     hold_after: Annotated[float, Field(ge=0, le=1)] = 0.3

@@ -343,26 +343,26 @@ def test_a_constant_reference_is_level_and_at_rest_in_every_phase(controller, pl
 def test_gaits_are_switched_at_their_times_in_one_trace(controller):
     """From bound to trot in the first flight, and to stand in the flight that comes next.
 
-    Bound from 0.1 s; trot is asked for at 0.23 s, 30 ms into the flight after front stance. Bound
-    again from 0.3 s; stand is asked for at 0.53 s, in rear stance: the flight after front stance
+    Bound from 0.1 s; trot is asked for at 0.18 s, in front stance: the flight after it begins at
+    0.2 s. Bound again from 0.3 s; stand is asked for at 0.53 s, in rear stance: that flight
     is that of the next cycle, from 0.3 + 0.35 + 0.1 s on.
     """
     chosen = {"gait.names": ["trot", "bound", "trot", "bound", "stand"]}
-    chosen |= {"gait.times": [0.0, 0.1, 0.23, 0.3, 0.53], "gait.stance_time": 0.22}
+    chosen |= {"gait.times": [0.0, 0.1, 0.18, 0.3, 0.53], "gait.stance_time": 0.22}
     config = bounding(**chosen)
     counted = jax.jit(chex.assert_max_traces(controller.plan, n=1))
     states, infos = plans(controller, build_params(config, go1.PARAMS), counted, 170)
     assert (infos.status == qp.Status.SOLVED).all()
-    gaits = [0] * 20 + [1] * 26 + [0] * 14 + [1] * 90 + [2] * 20
+    gaits = [0] * 20 + [1] * 20 + [0] * 20 + [1] * 90 + [2] * 20
     assert states.clock.gait.tolist() == gaits
-    modes = [Mode.TROT] * 20 + CYCLE[:26] + [Mode.TROT] * 14 + CYCLE + CYCLE[:20]
+    modes = [Mode.TROT] * 20 + CYCLE[:20] + [Mode.TROT] * 20 + CYCLE + CYCLE[:20]
     assert infos.mode.tolist() == modes + [Mode.STAND] * 20
     # Legs in the air when a gait begins have its time to come down, whatever they had before: the
     # rear ones of the bound front stance and flight, the others of the trot its stance.
     rear, swinging = [Leg.RR, Leg.RL], [Leg.FL, Leg.RR]
     np.testing.assert_allclose(states.swing.duration[20, rear], 0.20, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(states.stance[46], STANCE[Mode.TROT])
-    np.testing.assert_allclose(states.swing.duration[46, swinging], 0.22, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(states.stance[40], STANCE[Mode.TROT])
+    np.testing.assert_allclose(states.swing.duration[40, swinging], 0.22, rtol=0, atol=1e-12)
 
 
 def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait():
@@ -375,7 +375,7 @@ def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait
         (Mode.STAND, (True,) * 4, 0.06)
     ]
     assert landing.leave_when_done
-    assert not any(g.leave_when_done for g in others)
+    assert [g.leave_when_done for g in others] == [False, True, False]
     # One number for each gait, and the landing is at the trot's height.
     params = build_params(config, go1.PARAMS)
     assert len(gaits) == len(params.height) == len(params.swing.apex) == len(params.reference) == 4

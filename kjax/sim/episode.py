@@ -251,7 +251,7 @@ def _tracking(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         error = run.x[steady, 1] - np.where(bounding, config.bound.height, config.lmpc.height)
         result |= {
             "height_error_max_m": float(np.abs(error).max()),
-            "height_error_mean_m": float(error.mean()),
+            "height_error_mean_m": float(abs(error.mean())),
         }
     return result
 

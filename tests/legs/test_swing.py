@@ -25,7 +25,7 @@ planar_state = jax.jit(kinematics.planar_state)
 
 def settings(dtype="float64"):
     values = {"apex": APEX, "horizontal_fraction": ACROSS, "hold_after": HOLD_AFTER}
-    values |= {"offset": OFFSET}
+    values |= {"offset": OFFSET, "reach_speed": 0.8}
     values |= {"velocity_gain": 0.05, "kp": [200.0, 150.0, 120.0], "kd": [4.0, 3.0, 2.0]}
     return swing.SwingParams(**{name: jnp.asarray(v, dtype) for name, v in values.items()})
 
@@ -155,6 +155,48 @@ def test_a_held_foot_stays_where_it_first_touched():
     np.testing.assert_array_equal(gone.held_at, TARGET)
 
 
+CUT = np.array([True, True, False, False])
+
+
+def cut_short(contact, reach_speed=0.8):
+    """All legs are told to stand; the first two had their swing cut short."""
+    feet = jnp.asarray(TARGET) + jnp.array([0.0, 0.03])
+    params = settings()._replace(reach_speed=jnp.asarray(reach_speed))
+    stand = jnp.ones(4, bool)
+    return params, swing.end_swings(
+        params, swinging(0.1), stand, jnp.asarray(CUT), jnp.asarray(contact), feet
+    )
+
+
+def test_a_foot_whose_swing_was_cut_short_sinks_straight_down_until_it_touches():
+    params, state = cut_short([False, True, False, False])
+    np.testing.assert_array_equal(state.reaching, [True, False, False, False])
+    air, ground, none = jnp.zeros(4, bool), jnp.ones(4, bool), jnp.zeros(4, bool)
+    for _ in range(10):
+        state = swing.continue_swings(params, state, none, air, jnp.asarray(TARGET), 0.001)
+    position, velocity = swing.foot_reference(params, state, jnp.asarray(LIFT_OFF))
+    np.testing.assert_allclose(position[0], TARGET[0] + [0.0, 0.03 - 0.8 * 0.01], atol=1e-12)
+    np.testing.assert_allclose(velocity[0], [0.0, -0.8])
+    landed = swing.continue_swings(params, state, none, ground, jnp.asarray(TARGET), 0.001)
+    assert not landed.reaching.any()
+    # It presses from then on, whatever the contact sensor says.
+    again = swing.continue_swings(params, landed, none, air, jnp.asarray(TARGET), 0.001)
+    assert not again.reaching.any()
+
+
+def test_a_reaching_foot_that_lifts_off_again_reaches_no_more():
+    _, state = cut_short([False] * 4)
+    np.testing.assert_array_equal(state.reaching, CUT)
+    lifting = jnp.array([True, False, False, False])
+    state = swing.begin_swings(state, lifting, jnp.asarray(LIFT_OFF), jnp.full(4, 0.2))
+    np.testing.assert_array_equal(state.reaching, [False, True, False, False])
+
+
+def test_without_a_reach_speed_every_leg_presses_at_once():
+    _, state = cut_short([False] * 4, reach_speed=0.0)
+    assert not state.reaching.any()
+
+
 def test_a_stance_leg_neither_ages_nor_is_held():
     state = after(0.2, [True] * 4, moving=(False, True, False, True))
     np.testing.assert_array_equal(state.held, [False, True, False, True])
@@ -234,7 +276,7 @@ def test_each_gait_has_its_own_apex_gain_and_offset(dtype):
         assert picked.apex == stacked.apex[gait]
         assert picked.velocity_gain == stacked.velocity_gain[gait]
         np.testing.assert_array_equal(picked.offset, np.arange(4 * gait, 4 * gait + 4))
-        for name in ("horizontal_fraction", "hold_after", "kp", "kd"):
+        for name in ("horizontal_fraction", "hold_after", "reach_speed", "kp", "kd"):
             np.testing.assert_array_equal(getattr(picked, name), getattr(stacked, name))
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kjax import gait
-from kjax.config import BoundConfig, RunConfig
+from kjax.config import BoundConfig, MultiPhaseConfig, RunConfig
 from kjax.controller import _cycle_nodes, _multiphase_params, build_gaits
 from kjax.mpc import multiphase
 from kjax.robots import go1
@@ -22,7 +22,23 @@ DURATION = (0.1, 0.1, 0.05, 0.1)  # s
 
 @pytest.fixture(scope="module")
 def config():
-    return RunConfig(bound=BoundConfig(horizon="multiphase", feet_front=0.05, feet_rear=0.1))
+    return RunConfig(
+        bound=BoundConfig(
+            horizon="multiphase", feet_front=0.05, feet_rear=0.1, velocity_gain=0.075
+        ),
+        multiphase=MultiPhaseConfig(
+            state_weights=(16.0, 151.0, 13.8, 38.2, 2.67, 0.145),
+            input_weight=1.7e-6,
+            force_x_max=135.0,
+            force_z_min=10.0,
+            force_z_max=250.0,
+            friction=0.6,
+            torque_fraction=0.95,
+            inertia_scale=0.87,
+            velocity_time=0.3,
+            height_time=0.05,
+        ),
+    )
 
 
 @pytest.fixture(scope="module")
