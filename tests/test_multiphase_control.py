@@ -1,0 +1,147 @@
+"""The controller with a horizon through flight: in one program with the other gaits, and safe."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kjax import RunConfig, build_controller, build_params, load_config, qp
+from kjax.robots import go1
+from kjax.types import Leg, Mode, Observation
+
+DT = 0.005
+TIMES = [0.0, 0.4]
+
+
+def config(**changes):
+    chosen = {
+        "gait.names": ["bound", "trot"],
+        "gait.times": TIMES,
+        "bound.horizon": "multiphase",
+        "bound.ramp_start": 1.0,
+        "lmpc.integral_gains": [2.0, 1.0],
+        "command.times": [0.0],
+        "command.velocities": [0.05],
+        "lmpc.command_slew": np.inf,
+    }
+    return load_config(RunConfig, None, chosen | changes)
+
+
+def standing(**changes):
+    height, joints = go1.stand_pose(0.26)
+    floats = {
+        "base_pos": [0.0, 0.0, height],
+        "base_quat": [1.0, 0.0, 0.0, 0.0],
+        "base_vel": [0.0, 0.0, 0.0],
+        "base_ang_vel": [0.0, 0.0, 0.0],
+        "joint_pos": joints,
+        "joint_vel": np.zeros((4, 3)),
+    }
+    arrays = {key: jnp.asarray(value, float) for key, value in (floats | changes).items()}
+    return Observation(**arrays, contact=jnp.ones(4, bool))
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return build_controller(config())
+
+
+@pytest.fixture(scope="module")
+def params():
+    return build_params(config(), go1.PARAMS)
+
+
+@pytest.fixture(scope="module")
+def plan(controller):
+    return jax.jit(controller.plan)
+
+
+@pytest.fixture(scope="module")
+def ticks(controller, params, plan):
+    """States and infos of 130 plans of a robot that is held still: bound, then trot."""
+    state, log = controller.init(params, standing()), []
+    for _ in range(130):
+        state, info = plan(params, state, standing())
+        log.append((state, info))
+    return log
+
+
+def test_each_phase_is_planned_by_its_own_scheme_and_solved(ticks):
+    modes = [int(info.mode) for _, info in ticks]
+    assert set(modes) == {Mode.FRONT, Mode.FLIGHT, Mode.REAR, Mode.TROT}
+    for (state, info), mode in zip(ticks, modes, strict=True):
+        assert info.status == qp.Status.SOLVED
+        force = np.asarray(state.force)
+        standing_legs = np.asarray(state.stance)
+        np.testing.assert_array_equal(force[~standing_legs], 0.0)
+        if mode in (Mode.FRONT, Mode.REAR):
+            assert (force[standing_legs, 1] >= 10.0 - 1e-3).all()
+            # The robot is level: world and body frame are one.
+            ratio = np.abs(force[standing_legs, 0]) / force[standing_legs, 1]
+            assert (ratio <= 0.72 + 1e-3).all()
+            assert np.ptp(force[standing_legs], axis=0).max() == 0.0  # a pair shares
+
+
+def test_a_pitched_trunk_gets_the_same_world_force_in_its_own_frame(controller, params, plan):
+    turn = 0.2  # nose up: a turn about +y by -0.2
+    half = [np.cos(turn / 2), 0.0, -np.sin(turn / 2), 0.0]
+    seen = standing(base_quat=half)
+    state, info = plan(params, controller.init(params, seen), seen)
+    assert int(info.mode) == Mode.FRONT
+    force = np.asarray(state.force)[Leg.FR]
+    c, s = np.cos(turn), np.sin(turn)
+    world = np.array([[c, -s], [s, c]]) @ force
+    assert abs(world[0]) <= 0.72 * world[1] + 1e-3
+    assert 10.0 - 1e-3 <= world[1] <= 305.0 + 1e-3
+
+
+def test_a_nan_in_the_observation_is_reported_and_leaves_the_reference_force(
+    controller, params, plan
+):
+    state = controller.init(params, standing())
+    bad = standing(base_vel=[np.nan, 0.0, 0.0])
+    state, info = plan(params, state, bad)
+    assert info.status == qp.Status.NON_FINITE
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
+    force = np.asarray(state.force)
+    # What the front pair carries in the periodic motion: its share of the weight over the cycle.
+    share = 0.148 / (0.075 + 0.148)
+    load = 12.743 * 9.81 * 0.35 * share / (2 * 0.1)
+    assert force[[Leg.FR, Leg.FL], 1] == pytest.approx(load, rel=0.01)
+    _, info = plan(params, state, standing())
+    assert info.status == qp.Status.SOLVED
+
+
+def test_a_batch_of_robots_in_other_phases_equals_single_ones(plan, params, ticks):
+    chosen = [ticks[i][0] for i in (5, 25, 42, 120)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *chosen)
+    seen = standing()
+    states, infos = jax.vmap(plan, in_axes=(None, 0, None))(params, batch, seen)
+    for i, one in enumerate(chosen):
+        state, info = plan(params, one, seen)
+        assert infos.mode[i] == info.mode
+        np.testing.assert_allclose(states.force[i], state.force, atol=1e-4)
+
+
+def test_integral_action_adds_up_the_velocity_error_and_starts_afresh_with_a_gait(ticks):
+    gaits = np.array([int(state.clock.gait) for state, _ in ticks])
+    seen = np.array([np.asarray(state.correction) for state, _ in ticks])
+    # Held still under a command of 0.05 m/s, at 2 / s: 0.1 m/s^2 from the first tick on.
+    bounding = gaits == 1
+    n = bounding.sum()
+    np.testing.assert_allclose(seen[bounding, 0], 2.0 * DT * 0.05 * np.arange(1, n + 1), atol=1e-9)
+    first = np.flatnonzero(~bounding)[0]
+    np.testing.assert_array_equal(seen[first], 0.0)
+    assert seen[first + 1, 0] == pytest.approx(2.0 * DT * 0.05)
+
+
+def test_the_correction_stays_within_its_limit(controller, plan):
+    params = build_params(
+        config(**{"lmpc.integral_limits": [0.01, 0.02], "lmpc.integral_gains": [10.0, 1.0]}),
+        go1.PARAMS,
+    )
+    state = controller.init(params, standing())
+    for _ in range(40):
+        state, _ = plan(params, state, standing())
+    np.testing.assert_allclose(state.correction[0], 0.01)
+    assert abs(state.correction[1]) <= 0.02
