@@ -30,7 +30,7 @@ from kjax.mpc.lmpc import (
     shift_plan,
     solve_lmpc,
 )
-from kjax.types import LEG_PAIR, Command, Mode, Observation, RobotParams
+from kjax.types import Command, Mode, Observation, RobotParams
 
 
 class ControllerParams(NamedTuple):
@@ -341,7 +341,7 @@ def build_controller(config: RunConfig) -> Controller:
             velocity=velocity,
             correction=jnp.where(readable, correction, state.correction),
             plan=solved.plan,
-            force=solved.ends[LEG_PAIR] * stance[:, None],
+            force=jnp.broadcast_to(solved.ends[:, None], (2, 2, 2)).reshape(4, 2) * stance[:, None],
             swing=jax.tree.map(lambda new, old: jnp.where(readable, new, old), swings, state.swing),
             track=state.track,
         )
