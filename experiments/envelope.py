@@ -87,7 +87,7 @@ def _steady(speed: float, duration: float) -> dict[str, Any]:
     }
 
 
-_TROT, _BOUND = "trot_velocity.toml", "bound_velocity.toml"
+_TROT, _BOUND = "trot_velocity.toml", "bound_multiphase.toml"
 _FLYING = {"gait.trot_flight": 0.05, "gait.stance_time": 0.15}
 _BLOCKS = {"terrain.kind": "blocks", "terrain.count": 5}
 AXES = (

@@ -1,0 +1,41 @@
+"""Configuration: frozen dataclasses filled from TOML; a wrong key or value is one clear line.
+
+Every field's docstring ends with its unit in brackets; ``--help`` of the experiments shows them.
+"""
+
+from kjax.config.control import (
+    BoundConfig,
+    CommandConfig,
+    GaitConfig,
+    LateralConfig,
+    LegConfig,
+    LmpcConfig,
+    MultiPhaseConfig,
+)
+from kjax.config.loading import ConfigError, fields, load_config, to_dict
+from kjax.config.model import DatasetConfig, KoopmanConfig, SrbConfig
+from kjax.config.run import FitStudyConfig, RunConfig
+from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
+
+__all__ = [
+    "BoundConfig",
+    "CommandConfig",
+    "ConfigError",
+    "DatasetConfig",
+    "FitStudyConfig",
+    "GaitConfig",
+    "KoopmanConfig",
+    "LateralConfig",
+    "LegConfig",
+    "LmpcConfig",
+    "MultiPhaseConfig",
+    "NoiseConfig",
+    "PushConfig",
+    "RunConfig",
+    "SimConfig",
+    "SrbConfig",
+    "TerrainConfig",
+    "fields",
+    "load_config",
+    "to_dict",
+]

@@ -1,0 +1,46 @@
+"""What the sections share: strictness, kinds of numbers, and checks across keys."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field
+
+STRICT = ConfigDict(extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(gt=0)]
+# The only quantities that may be infinite: bounds that a user wants to switch off.
+Bound = Annotated[float, Field(allow_inf_nan=True)]
+
+
+def require_timeline(times: Sequence[float], name: str, values: Sequence[object]) -> None:
+    """Refuse pieces in time that are not as many as their values, or not in order from 0 on."""
+    if not times or len(times) != len(values):
+        raise ValueError(
+            f"times and {name} must be equally long and not empty, got {len(times)} and "
+            f"{len(values)}"
+        )
+    if times[0] != 0.0:
+        raise ValueError(f"times must start at 0, got {list(times)}")
+    if any(b <= a for a, b in itertools.pairwise(times)):
+        raise ValueError(f"times must increase, got {list(times)}")
+
+
+def require_multiple(name: str, value: float, base_name: str, base: float) -> None:
+    """Refuse a time that is not a whole multiple of another one [s]."""
+    ratio = value / base
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6:
+        raise ValueError(
+            f"{name} must be a whole multiple of {base_name}, got {value} s and {base} s"
+        )
+
+
+def require_order(config: Any) -> None:
+    """Refuse bounds of F_z that leave nothing between them."""
+    if not config.force_z_min <= config.force_z_max:
+        raise ValueError(
+            f"force_z_min must not exceed force_z_max, got {config.force_z_min} and "
+            f"{config.force_z_max}"
+        )

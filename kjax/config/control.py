@@ -1,0 +1,253 @@
+"""The controller: command, LMPC, gaits, legs."""
+
+from math import inf
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from kjax.config.checks import (
+    STRICT,
+    Bound,
+    Count,
+    NonNegative,
+    Positive,
+    require_order,
+    require_timeline,
+)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class CommandConfig:
+    """Forward velocity command: a step function of time."""
+
+    times: tuple[NonNegative, ...] = (0.0, 6.0, 10.0, 14.0, 18.0)
+    """Start of each piece, increasing, the first one 0 [s]."""
+    velocities: tuple[float, ...] = (0.0, 0.1, 0.3, 0.2, 0.0)
+    """Velocity that holds from each of those times on [m/s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "CommandConfig":
+        require_timeline(self.times, "velocities", self.velocities)
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class LmpcConfig:
+    """Linear MPC on the lifted models."""
+
+    control_dt: Positive = 0.005
+    """Time between two plans [s]."""
+    model_dt: Positive = 0.001
+    """Step of the prediction model, a multiple of koopman.dataset.dt [s]."""
+    horizon: Count = 6
+    """Length of the prediction, in steps of model_dt [-]."""
+    state_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (2000.0, 3e4, 1200.0, 12.0, 3.0, 0.08)
+    """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
+    input_weight: Positive = 1e-5
+    """R of every force [1/N^2]."""
+    input_reference: Literal["zero", "hover"] = "zero"
+    """What R penalises the distance from: no force (the paper) or half the weight each [-]."""
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 60.0
+    """Bound of |F_x| per leg, body frame [N]."""
+    force_z_min: Bound = 0.0
+    """Lower bound of F_z per leg, body frame [N]."""
+    force_z_max: Bound = 160.0
+    """Upper bound of F_z per leg, body frame [N]."""
+    height: Positive = 0.27
+    """Reference height of the centre of mass above ground [m]."""
+    height_above: Literal["ground", "feet"] = "ground"
+    """What the reference height is measured from: z = 0, or the stance feet (rough ground) [-]."""
+    command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
+    """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
+    integral_gains: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """Rates at which the errors of velocity and pitch move their references; 0: not [1/s]."""
+    integral_limits: tuple[NonNegative, NonNegative] = (0.15, 0.15)
+    """Largest correction of velocity and pitch reference by that [m/s, rad]."""
+    position_slack: Positive = 0.10
+    """Largest lead or lag of the integrated position reference before the body [m]."""
+    solver: Literal["admm", "projected_gradient"] = "admm"
+    """Method of the box QP [-]."""
+    tolerance: Positive = 1e-6
+    """Relative KKT residual at which the QP counts as solved [-]."""
+    max_iterations: Count = 2000
+    """Iteration limit of the QP [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "LmpcConfig":
+        require_order(self)
+        return self
+
+
+GaitName = Literal["trot", "bound", "stand"]
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class GaitConfig:
+    """Which gait when."""
+
+    names: tuple[GaitName, ...] = ("trot",)
+    """Gaits to walk in, one after the other [-]."""
+    times: tuple[NonNegative, ...] = (0.0,)
+    """When each of them is asked for, increasing, the first one 0 [s]."""
+    stance_time: Positive = 0.25
+    """Duration of each trot stance; the other diagonal swings meanwhile [s]."""
+    trot_flight: NonNegative = 0.0
+    """Flight after each trot stance; more than 0 makes a flying trot [s]."""
+    switch_rule: Literal["flight", "anywhere"] = "flight"
+    """When a bound may be left: in the flight after front stance (Raibert), or at once [-]."""
+    landing_time: NonNegative = 0.0
+    """Four-leg stance between a bound and the next gait [s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "GaitConfig":
+        require_timeline(self.times, "names", self.names)
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class BoundConfig:
+    """The bound: timing, feet, reference, and its own LMPC weights and bounds."""
+
+    front_stance: Positive = 0.1
+    """Duration of the front stance [s]."""
+    first_flight: Positive = 0.1
+    """Duration of the flight after it [s]."""
+    rear_stance: Positive = 0.05
+    """Duration of the rear stance [s]."""
+    second_flight: Positive = 0.1
+    """Duration of the flight after it [s]."""
+    ramp_start: Annotated[float, Field(gt=0, le=1)] = 0.3
+    """Length of the flights in the first cycle, as a fraction of the full one [-]."""
+    ramp_cycles: Annotated[int, Field(ge=0)] = 10
+    """Number of cycles over which the flights grow to their full length [-]."""
+    feet_front: Positive = 0.075
+    """Distance of the front footholds ahead of the centre of mass, standing still [m]."""
+    feet_rear: Positive = 0.148
+    """Distance of the rear footholds behind the centre of mass, standing still [m]."""
+    horizon: Literal["stance", "multiphase"] = "stance"
+    """What the prediction covers: the present stance (the paper), or a whole cycle ([multiphase],
+    which then has the weights and bounds) [-]."""
+    reference: Literal["periodic", "constant"] = "periodic"
+    """Reference of height and pitch: the cycle's own motion, or constant (the paper) [-]."""
+    height: Positive = 0.27
+    """Mean height of the centre of mass in stance [m]."""
+    state_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (1084.0, 1211.0, 60.0, 3.06, 3.05, 0.1)
+    """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
+    input_weight: Positive = 5.7e-7
+    """R of every force [1/N^2]."""
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 51.5
+    """Bound of |F_x| per leg, body frame [N]."""
+    force_z_min: Bound = 20.0
+    """Lower bound of F_z per leg: a foot that carries no weight slips [N]."""
+    force_z_max: Bound = 300.0
+    """Upper bound of F_z per leg, body frame [N]."""
+    velocity_gain: NonNegative = 0.075
+    """Raibert gain on the velocity error in the foothold [s]."""
+    apex: Positive = 0.064
+    """Height of the swing above the higher of lift-off and target [m]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "BoundConfig":
+        require_order(self)
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class MultiPhaseConfig:
+    """LMPC of the bound over one gait cycle, through flight; for bound.horizon = "multiphase"."""
+
+    node_dt: Positive = 0.0125
+    """Longest node of a stance; a flight is one node [s]."""
+    state_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (32.6, 95.3, 12.9, 50.7, 1.59, 0.323)
+    """Q of (p_x, p_z, theta, v_x, v_z, omega), per second [1/s times that of bound]."""
+    input_weight: Positive = 1.64e-5
+    """R of every force's distance from the periodic one, per second [1/(N^2 s)]."""
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 80.0
+    """Bound of |F_x| per leg, world frame [N]."""
+    force_z_min: Bound = 10.0
+    """Lower bound of F_z per leg, world frame [N]."""
+    force_z_max: Bound = 305.0
+    """Upper bound of F_z per leg, world frame [N]."""
+    friction: Positive = 0.72
+    """mu of the pyramid |F_x| <= mu F_z; below the ground's, for margin [-]."""
+    torque_fraction: Annotated[float, Field(gt=0, le=1)] = 0.95
+    """Part of the thigh's and the calf's torque limit that planned forces may take [-]."""
+    inertia_scale: Positive = 0.883
+    """Pitch inertia of the prediction over srb.inertia: legs in swing count for less [-]."""
+    velocity_time: Positive = 0.51
+    """Time in which the velocity is predicted to reach its reference, for moment arms [s]."""
+    height_time: Positive = 0.16
+    """The same of height and pitch [s]."""
+    tolerance: Positive = 1e-6
+    """Relative residuals and gap at which the QP counts as solved [-]."""
+    max_iterations: Count = 30
+    """Iteration limit of the interior point [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "MultiPhaseConfig":
+        require_order(self)
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class LegConfig:
+    """Swing trajectory, footholds and joint control."""
+
+    apex: Positive = 0.06
+    """Height of the swing above the higher of lift-off and target [m]."""
+    horizontal_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
+    """Part of the swing after which the foot has arrived above its foothold [-]."""
+    velocity_gain: NonNegative = 0.03
+    """Raibert gain on the velocity error in the foothold [s]."""
+    reach_speed: NonNegative = 1.0
+    """Speed at which a foot feels for the ground when a change of gait has cut its swing short;
+    0: its leg presses at once [m/s]."""
+    hold_after: Annotated[float, Field(ge=0, le=1)] = 0.3
+    """Part of the swing after which a contact is an obstacle and the foot is held [-]."""
+    kp: NonNegative = 150.0
+    """Stiffness of thigh and calf joint in swing [N m/rad]."""
+    kd: NonNegative = 3.0
+    """Damping of thigh and calf joint in swing [N m s/rad]."""
+    kp_abduction: NonNegative = 200.0
+    """Stiffness of the abduction joint: in swing, or always on the planar base [N m/rad]."""
+    kd_abduction: NonNegative = 4.0
+    """Damping of the abduction joint, likewise [N m s/rad]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class LateralConfig:
+    """Regulator of roll, yaw and sideways motion; for sim.base = "free" only."""
+
+    roll_stiffness: NonNegative = 60.0
+    """Roll moment per roll [N m/rad]."""
+    roll_damping: NonNegative = 4.0
+    """Roll moment per roll rate [N m s/rad]."""
+    yaw_stiffness: NonNegative = 20.0
+    """Yaw moment per yaw away from the heading at the start [N m/rad]."""
+    yaw_damping: NonNegative = 3.0
+    """Yaw moment per yaw rate [N m s/rad]."""
+    damping: NonNegative = 30.0
+    """Sideways force per sideways velocity of the centre of mass [N s/m]."""
+    wrench_weights: tuple[
+        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    ] = (1.0, 0.3, 1.0, 20.0, 20.0, 10.0)
+    """Weights of the wrench (force x, y, z, moment x, y, z) [1/N^2, 1/(N m)^2]."""
+    force_weight: Positive = 1e-3
+    """Weight of a change of the planned foot forces [1/N^2]."""
+    friction: NonNegative = 0.7
+    """Sideways over vertical force of a foot, at most [-]."""
+    friction_offset: NonNegative = 3.0
+    """Horizontal force allowed beyond that [N]."""
+    plan_friction: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 0.8
+    """The planned F_x is cut at this part of F_z; inf leaves it to the LMPC's box [-]."""
+    plan_friction_bound: Annotated[float, Field(ge=0, allow_inf_nan=True)] = inf
+    """The same in a bound, which loses speed by it: its F_z falls to bound.force_z_min [-]."""
+    velocity_gain: NonNegative = 0.05
+    """Sideways foothold per sideways velocity, beyond Raibert's law [s]."""

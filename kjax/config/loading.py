@@ -1,0 +1,103 @@
+"""From TOML and the command line to a config; a wrong key or value is one clear line."""
+
+import dataclasses
+import difflib
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names file, key, value and wish."""
+
+
+def fields(cls: type, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
+    """Leaf keys of a config class as (dotted name, field, default)."""
+    for name, info in cls.__pydantic_fields__.items():  # type: ignore[attr-defined]
+        if dataclasses.is_dataclass(info.annotation):
+            yield from fields(info.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
+        else:
+            yield f"{prefix}{name}", info, info.default
+
+
+def load_config(
+    cls: type[T], path: str | Path | None = None, overrides: Mapping[str, Any] | None = None
+) -> T:
+    """Config of type ``cls`` from a TOML file, with overrides by dotted name.
+
+    Args:
+      cls: a config dataclass of this module.
+      path: TOML file; ``None`` means all defaults.
+      overrides: e.g. ``{"lmpc.horizon": 10}``; they win over the file.
+
+    Raises:
+      ConfigError: with one line that names the file, the key, what came and what was wanted.
+    """
+    data: dict[str, Any] = {}
+    source = "command line"
+    if path is not None:
+        source = str(path)
+        try:
+            data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise ConfigError(f"{source}: no such file{_nearest_file(Path(path))}") from None
+        except OSError as error:
+            raise ConfigError(f"{source}: cannot be read: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    for key, value in (overrides or {}).items():
+        *sections, leaf = key.split(".")
+        node = data
+        for section in sections:
+            node = node.setdefault(section, {})
+            if not isinstance(node, dict):
+                raise ConfigError(f"{source}: {key}: '{section}' is a value, not a section")
+        node[leaf] = value
+    try:
+        # Through JSON, since strict mode then takes lists for tuples but still no "3" for 3.
+        return TypeAdapter(cls).validate_json(json.dumps(data, default=str), strict=True)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(error, cls)}") from None
+
+
+def _explain(error: ValidationError, cls: type) -> str:
+    """One line on the first problem, and how many more there are."""
+    first, *rest = error.errors(include_url=False)
+    loc = tuple(str(part) for part in first["loc"])
+    key = ".".join(loc)
+    came = first["input"]
+    if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        names = {name for name, _, _ in fields(cls)}
+        names |= {name.rsplit(".", 1)[0] for name in names if "." in name}
+        near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        text = f"{key}: unknown key (got {came!r}){hint}"
+    elif first["type"] == "value_error":
+        wish = first["msg"].removeprefix("Value error, ")
+        text = f"{key}: {wish}" if key else wish
+    else:
+        wish = first["msg"].removeprefix("Input should be ")
+        options = [str(o) for o in first.get("ctx", {}).get("expected", "").split("'")[1::2]]
+        near = difflib.get_close_matches(str(came), options, n=1, cutoff=0.5)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        text = f"{key}: got {came!r}, wanted {wish}{hint}"
+    return text + (f" (and {len(rest)} more)" if rest else "")
+
+
+def _nearest_file(path: Path) -> str:
+    if not path.parent.is_dir():
+        return ""
+    near = difflib.get_close_matches(path.name, [p.name for p in path.parent.glob("*.toml")], n=1)
+    return f"; did you mean '{path.parent / near[0]}'?" if near else ""
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The config as nested plain data (lists for tuples), ready for TOML or JSON."""
+    return TypeAdapter(type(config)).dump_python(config, mode="json")

@@ -1,0 +1,113 @@
+"""Whole configurations: a closed-loop run, the fit study."""
+
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+
+from kjax.config.checks import STRICT, Count, Positive, require_multiple
+from kjax.config.control import (
+    BoundConfig,
+    CommandConfig,
+    GaitConfig,
+    LateralConfig,
+    LegConfig,
+    LmpcConfig,
+    MultiPhaseConfig,
+)
+from kjax.config.model import KoopmanConfig, SrbConfig
+from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RunConfig:
+    """One closed-loop run."""
+
+    duration: Positive = 22.0
+    """Simulated time [s]."""
+    seed: int = 0
+    """Seed of noise and initial state [-]."""
+    command: CommandConfig = CommandConfig()
+    """Velocity command."""
+    srb: SrbConfig = SrbConfig()
+    """Single rigid body of the prediction."""
+    koopman: KoopmanConfig = KoopmanConfig()
+    """Prediction models."""
+    lmpc: LmpcConfig = LmpcConfig()
+    """Model predictive control."""
+    gait: GaitConfig = GaitConfig()
+    """Gait."""
+    bound: BoundConfig = BoundConfig()
+    """Bound."""
+    multiphase: MultiPhaseConfig = MultiPhaseConfig()
+    """Multi-phase horizon of the bound."""
+    leg: LegConfig = LegConfig()
+    """Swing legs."""
+    lateral: LateralConfig = LateralConfig()
+    """Roll, yaw and sideways motion of a free base."""
+    sim: SimConfig = SimConfig()
+    """Physics."""
+    terrain: TerrainConfig = TerrainConfig()
+    """Terrain."""
+    push: PushConfig = PushConfig()
+    """Pushes."""
+    noise: NoiseConfig = NoiseConfig()
+    """Noise."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "RunConfig":
+        require_multiple("lmpc.control_dt", self.lmpc.control_dt, "sim.sim_dt", self.sim.sim_dt)
+        require_multiple(
+            "lmpc.model_dt", self.lmpc.model_dt, "koopman.dataset.dt", self.koopman.dataset.dt
+        )
+        require_multiple("push.duration", self.push.duration, "sim.sim_dt", self.sim.sim_dt)
+        lateral = self.push.lateral
+        if self.sim.base == "planar" and any(lateral if isinstance(lateral, tuple) else [lateral]):
+            raise ValueError(f"push.lateral needs sim.base = 'free', got {lateral} and 'planar'")
+        bound = self.bound
+        shortest = {
+            "gait.stance_time": self.gait.stance_time,
+            "bound.front_stance": bound.front_stance,
+            "bound.rear_stance": bound.rear_stance,
+            "bound.first_flight times ramp_start": bound.first_flight * bound.ramp_start,
+            "bound.second_flight times ramp_start": bound.second_flight * bound.ramp_start,
+        }
+        for name, value in (
+            ("gait.trot_flight", self.gait.trot_flight),
+            ("gait.landing_time", self.gait.landing_time),
+        ):
+            if value > 0:
+                shortest[name] = value
+        for name, value in shortest.items():
+            if value < self.lmpc.control_dt:
+                raise ValueError(
+                    f"{name} is {value} s, shorter than lmpc.control_dt {self.lmpc.control_dt} s"
+                )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class FitStudyConfig:
+    """The fit study of the paper's Fig. 3."""
+
+    srb: SrbConfig = SrbConfig()
+    """Single rigid body."""
+    koopman: KoopmanConfig = KoopmanConfig()
+    """Models and training data."""
+    test_states: Count = 50
+    """Number of random initial states per mode [-]."""
+    test_profiles: Count = 50
+    """Number of random force profiles, each applied to every initial state [-]."""
+    test_duration: Positive = 0.05
+    """Length of a test rollout [s]."""
+    test_seed: int = 1000
+    """Seed of the test set [-]."""
+    scales: tuple[Positive, ...] = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+    """Sampling ranges of the scan, as fractions of koopman.dataset's [-]."""
+    tolerance: Positive = 1e-4
+    """Error that the paper claims; the scan reports the largest range within it [m, rad, ...]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "FitStudyConfig":
+        require_multiple(
+            "test_duration", self.test_duration, "koopman.dataset.dt", self.koopman.dataset.dt
+        )
+        return self

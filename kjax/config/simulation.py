@@ -1,0 +1,115 @@
+"""The world: terrain, pushes, noise, physics."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from kjax.config.checks import STRICT, Count, NonNegative, Positive
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class TerrainConfig:
+    """Obstacles on the way."""
+
+    kind: Literal["flat", "paper", "blocks", "steps", "slope", "patches"] = "flat"
+    """None; the paper's blocks, cubes and capsules; or one of ours [-]."""
+    seed: int = 0
+    """Seed of the field; independent of the noise's [-]."""
+    count: Count = 8
+    """Number of obstacles, steps or patches [-]."""
+    start: Positive = 0.8
+    """Where the field begins, measured from the robot's start [m]."""
+    end: Positive = 2.6
+    """Where it ends [m]."""
+    height_min: Positive = 0.05
+    """Lowest obstacle, or rise of a step [m]."""
+    height_max: Positive = 0.07
+    """Highest obstacle, or rise of a step [m]."""
+    slope: Annotated[float, Field(gt=0, lt=45)] = 8.0
+    """Inclination of a slope [deg]."""
+    patch_friction: Positive = 0.3
+    """Friction of a foot on a patch [-]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "TerrainConfig":
+        for low, high in (("start", "end"), ("height_min", "height_max")):
+            if not getattr(self, low) <= getattr(self, high):
+                raise ValueError(
+                    f"{low} must not exceed {high}, got {getattr(self, low)} and "
+                    f"{getattr(self, high)}"
+                )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class PushConfig:
+    """Pushes on the trunk, at its centre of mass, in the world frame."""
+
+    times: tuple[NonNegative, ...] = ()
+    """When each push begins; none by default [s]."""
+    forward: float | tuple[float, ...] = 0.0
+    """Impulse along x, of every push or of each [N s]."""
+    lateral: float | tuple[float, ...] = 0.0
+    """Impulse along y, to the left; the free base only [N s]."""
+    duration: Positive = 0.1
+    """Time over which an impulse is spread evenly [s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "PushConfig":
+        for name in ("forward", "lateral"):
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) != len(self.times):
+                raise ValueError(
+                    f"{name} must be one number or as many as times, got {len(value)} and "
+                    f"{len(self.times)}"
+                )
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class NoiseConfig:
+    """Sensor noise (white, each physics step) and spread of the initial state; 1 sigma each."""
+
+    enabled: bool = True
+    """Whether noise and initial spread are applied [-]."""
+    position: NonNegative = 0.001
+    """Trunk position [m]."""
+    pitch: NonNegative = 0.003
+    """Trunk orientation [rad]."""
+    velocity: NonNegative = 0.02
+    """Trunk velocity [m/s]."""
+    pitch_rate: NonNegative = 0.05
+    """Trunk angular velocity [rad/s]."""
+    joint_position: NonNegative = 0.001
+    """Joint angles [rad]."""
+    joint_velocity: NonNegative = 0.02
+    """Joint rates [rad/s]."""
+    initial_pitch: NonNegative = 0.02
+    """Pitch at the start [rad]."""
+    initial_velocity: NonNegative = 0.05
+    """Trunk velocity at the start [m/s]."""
+    initial_pitch_rate: NonNegative = 0.2
+    """Trunk pitch rate at the start [rad/s]."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SimConfig:
+    """Physics."""
+
+    sim_dt: Positive = 0.001
+    """Physics step; torques are recomputed at each [s]."""
+    base: Literal["planar", "free"] = "planar"
+    """Trunk on two slides and a pitch hinge, or free; the controller is built for either [-]."""
+    friction: Positive = 0.8
+    """Sliding friction coefficient of the feet [-]."""
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    """Friction cone of the contact solver; MJX wants the pyramid [-]."""
+    contacts: Literal["all", "feet"] = "all"
+    """Which of the robot's bodies touch the ground: all, or the feet only (faster) [-]."""
+    joint_damping: NonNegative = 0.1
+    """Viscous joint damping [N m s/rad]."""
+    joint_armature: NonNegative = 0.01
+    """Reflected rotor inertia [kg m^2]."""
+    contact_threshold: NonNegative = 5.0
+    """Foot force above which the contact sensor fires [N]."""
