@@ -5,13 +5,14 @@ and one ``Row`` per number to show.
 """
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from kjax.config import RunConfig, load_config
-from kjax.controller import build_gaits
 from kjax.gait import Gait
+from kjax.params import build_gaits
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
@@ -294,16 +295,14 @@ def mid_stances(gait: Gait, begin: float, after: float, count: int) -> list[floa
       count: number of times.
     """
     stances: list[tuple[float, float]] = []
-    time, round_ = begin, 0
-    while len(stances) < 2:
-        grown = min(round_ / gait.ramp_cycles, 1.0) if gait.ramp_cycles else 1.0
-        for phase in gait.phases:
-            flying = not any(phase.stance)
-            scale = gait.ramp_start + (1.0 - gait.ramp_start) * grown if flying else 1.0
-            if not flying and time >= after:
-                stances.append((time, phase.duration))
-            time += phase.duration * scale
-        round_ += 1
+    time = begin
+    for cycle in itertools.count():
+        for phase, duration in zip(gait.phases, gait.durations(cycle), strict=True):
+            if any(phase.stance) and time >= after:
+                stances.append((time, duration))
+            time += duration
+        if len(stances) >= 2:
+            break
     return [
         start + duration * (0.25 + 0.5 * i / count)
         for i in range(count)

@@ -8,7 +8,8 @@ The core imports jax, numpy and pydantic only; ``kjax.sim`` needs the extra ``si
 """
 
 from kjax.config import ConfigError, RunConfig, load_config
-from kjax.controller import Controller, ControllerParams, build_controller, build_params
+from kjax.controller import Controller, build_controller
+from kjax.params import ControllerParams, build_params
 from kjax.types import Leg, Mode, Observation
 
 __version__ = "0.1.0"

@@ -42,9 +42,6 @@ class Mode(IntEnum):
 # Number of stance legs at the front and at the rear (the paper's alpha_i, alpha_j), by mode.
 MODE_ALPHA = np.array([[0, 0], [2, 0], [0, 2], [1, 1], [2, 2]])
 
-# Which of the two forces of u = [F_front, F_rear] a leg carries.
-LEG_PAIR = np.array([0, 0, 1, 1])
-
 
 class Observation(NamedTuple):
     """What the controller reads of the robot, from any simulator or state estimator.

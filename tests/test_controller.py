@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kjax import Observation, RunConfig, build_controller, build_params, load_config, qp
-from kjax.controller import build_gaits
+from kjax.params import build_gaits
 from kjax.robots import go1
 from kjax.types import Leg, Mode
 

@@ -51,6 +51,12 @@ class Gait(NamedTuple):
     leave_when_done: bool = False
     leave_through: str = ""
 
+    def durations(self, cycle: int) -> list[float]:
+        """Length of each phase in a cycle, counted from the gait's beginning [s]."""
+        grown = min(cycle / self.ramp_cycles, 1.0) if self.ramp_cycles else 1.0
+        scale = self.ramp_start + (1.0 - self.ramp_start) * grown
+        return [p.duration * (scale if p.mode == Mode.FLIGHT else 1.0) for p in self.phases]
+
 
 class Schedule(NamedTuple):
     """Stacked gaits (G gaits, P phases; padding is never entered).
@@ -256,15 +262,15 @@ def start(gait: Int[Array, ""], elapsed: Float[Array, ""]) -> Clock:
     return Clock(gait=gait, phase=zero, cycle=zero, elapsed=elapsed)
 
 
-def flight_scale(schedule: Schedule, clock: Clock) -> Float[Array, ""]:
+def flight_scale(schedule: Schedule, clock: Clock) -> Float[Array, "*k"]:
     """Fraction of their full length that the flights have in this cycle [-]."""
     begin, cycles = schedule.ramp_start[clock.gait], schedule.ramp_cycles[clock.gait]
     grown = jnp.where(cycles > 0, jnp.minimum(clock.cycle / jnp.maximum(cycles, 1), 1.0), 1.0)
     return begin + (1.0 - begin) * grown.astype(begin.dtype)
 
 
-def phase_duration(schedule: Schedule, clock: Clock) -> Float[Array, ""]:
-    """Length of the phase that the clock is in [s]."""
+def phase_duration(schedule: Schedule, clock: Clock) -> Float[Array, "*k"]:
+    """Length of the phase that the clock is in [s]; of several, if the clock's leaves have axes."""
     where = (clock.gait, clock.phase)
     scale = jnp.where(schedule.mode[where] == Mode.FLIGHT, flight_scale(schedule, clock), 1.0)
     return schedule.duration[where] * scale
@@ -320,11 +326,7 @@ def preview(schedule: Schedule, clock: Clock, shortest: float) -> Preview:
         cycle=clock.cycle + wraps,
         elapsed=jnp.zeros_like(slot, dtype=clock.elapsed.dtype),
     )
-    full = jax.vmap(
-        lambda phase, cycle: phase_duration(
-            schedule, seen._replace(phase=phase, cycle=cycle, elapsed=clock.elapsed)
-        )
-    )(seen.phase, seen.cycle)
+    full = phase_duration(schedule, seen)
     left = jnp.clip(full[0] - clock.elapsed, shortest, full[0])
     duration = jnp.select([slot == 0, slot < count, slot == count], [left, full, full - left], 0.0)
     return Preview(

@@ -11,8 +11,8 @@ import numpy as np
 
 from kjax import qp
 from kjax.config import CommandConfig, NoiseConfig, PushConfig, RunConfig, TerrainConfig
-from kjax.controller import build_gaits
 from kjax.legs.base import build_base
+from kjax.params import build_gaits
 from kjax.robots import go1
 from kjax.sim import free_base
 from kjax.sim.observe import NOISE_DIM, Observe, noise_dim, noise_scale

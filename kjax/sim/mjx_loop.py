@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from kjax.config import RunConfig
-from kjax.controller import Controller, ControllerParams, ControllerState, PlanInfo
+from kjax.controller import Controller, ControllerState, PlanInfo
+from kjax.params import ControllerParams
 from kjax.sim.observe import add_noise, build_observe, resolve
 from kjax.sim.push import push_force, pushed_body
 from kjax.sim.scene import build_spec

@@ -15,13 +15,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from kjax.config import RunConfig
-from kjax.controller import (
-    Controller,
-    ControllerParams,
-    ControllerState,
-    build_controller,
-    build_params,
-)
+from kjax.controller import Controller, ControllerState, build_controller
+from kjax.params import ControllerParams, build_params
 from kjax.robots import go1
 from kjax.sim import free_base, terrain
 from kjax.sim.episode import (

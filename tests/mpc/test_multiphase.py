@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 from kjax import gait
 from kjax.config import BoundConfig, MultiPhaseConfig, RunConfig
-from kjax.controller import _cycle_nodes, _multiphase_params, build_gaits
 from kjax.mpc import multiphase
+from kjax.params import build_gaits, cycle_nodes, multiphase_params
 from kjax.robots import go1
 from kjax.types import GRAVITY, Leg, Mode
 
@@ -43,7 +43,7 @@ def config():
 
 @pytest.fixture(scope="module")
 def params(config):
-    return _multiphase_params(build_gaits(config), config, go1.PARAMS)
+    return multiphase_params(build_gaits(config), config, go1.PARAMS)
 
 
 @pytest.fixture(scope="module")
@@ -274,8 +274,8 @@ def test_a_tighter_torque_limit_binds(params, plan):
 
 def test_only_a_bound_with_that_horizon_has_nodes(config):
     gaits = build_gaits(config)
-    nodes = _cycle_nodes(gaits, config)
+    nodes = cycle_nodes(gaits, config)
     assert nodes[BOUND].tolist() == [8, 1, 4, 1]
     assert nodes.sum() == nodes[BOUND].sum()
-    assert _cycle_nodes(gaits, RunConfig()).sum() == 0
+    assert cycle_nodes(gaits, RunConfig()).sum() == 0
     assert [phase.mode for phase in gaits[BOUND].phases][1] == Mode.FLIGHT

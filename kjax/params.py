@@ -1,0 +1,227 @@
+"""All numbers of a controller, and how they come from a config: fit, condense, gather."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from kjax import gait
+from kjax.config import RunConfig
+from kjax.gait.reference import SAMPLES, periodic_reference
+from kjax.koopman.edmd import fit_modes, srb_params
+from kjax.legs import lateral, swing
+from kjax.mpc import multiphase
+from kjax.mpc.lmpc import LmpcTables, build_tables, mode_settings
+from kjax.types import Command, Mode, RobotParams
+
+
+class ControllerParams(NamedTuple):
+    """All numbers of a controller; data, so any leaf may be batched or replaced.
+
+    Attributes:
+      robot: geometry and masses.
+      tables: LMPC per contact mode.
+      schedule: gaits.
+      gait_times: (K,) times at which a gait is asked for, the first one 0 [s].
+      gaits: (K,) index of the gait asked for then.
+      reference: (G, ramp levels, P, samples, 4) periodic motion of each gait; see
+        ``gait.reference``.
+      multiphase: LMPC over a gait cycle, for gaits that use it.
+      swing: swing settings.
+      lateral: regulator of roll, yaw and sideways motion; of no effect on the planar base.
+      command: forward velocity over time.
+      height: (G,) mean height of the centre of mass [m].
+      follow_ground: 1 to measure it from the stance feet, 0 from z = 0 [-].
+      command_slew: largest rate of change of the reference velocity [m/s^2].
+      integral: (2, 2) integral action on velocity and pitch: its rates [1/s] and its limits
+        [m/s, rad].
+      position_slack: clamp of the position reference [m].
+    """
+
+    robot: RobotParams
+    tables: LmpcTables
+    schedule: gait.Schedule
+    gait_times: Float[Array, "K"]
+    gaits: Int[Array, "K"]
+    reference: Float[Array, "G levels P samples 4"]
+    multiphase: multiphase.MultiPhaseParams
+    swing: swing.SwingParams
+    lateral: lateral.LateralParams
+    command: Command
+    height: Float[Array, "G"]
+    follow_ground: Float[Array, ""]
+    command_slew: Float[Array, ""]
+    integral: Float[Array, "2 2"]
+    position_slack: Float[Array, ""]
+
+
+def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) -> ControllerParams:
+    """Fit the Koopman models, condense the LMPC and gather everything that ``plan`` needs.
+
+    The work is done in float64 whatever the caller's default; the result is cast once.
+
+    Args:
+      config: of the run.
+      robot: e.g. ``kjax.robots.go1.PARAMS``.
+      dtype: floating type of the result; JAX's current default if ``None``.
+    """
+    dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    gaits = build_gaits(config)
+    names = [g.name for g in gaits]
+    leg, bound, sideways = config.leg, config.bound, config.lateral
+    is_bound = np.array([name == "bound" for name in names])
+    sole = robot.foot_radius - bound.height
+    bound_feet = ((bound.feet_front, float(sole)), (-bound.feet_rear, float(sole)))
+    with jax.enable_x64(True):
+        body = srb_params(config.srb, {Mode.FRONT: bound_feet, Mode.REAR: bound_feet})
+        key = jax.random.key(config.koopman.dataset.seed)
+        model, report = _fit_modes(body, config.koopman, key)
+        if not bool(report.finite.all()):
+            raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
+        params = ControllerParams(
+            robot=robot,
+            tables=_build_tables(
+                model,
+                mode_settings(config.lmpc, bound, config.srb.mass),
+                steps=round(config.lmpc.model_dt / config.koopman.dataset.dt),
+                horizon=config.lmpc.horizon,
+                feet=body.feet,
+            ),
+            schedule=gait.build_schedule(gaits),
+            gait_times=jnp.asarray(config.gait.times),
+            gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
+            reference=jnp.asarray(_reference_tables(gaits, config)),
+            multiphase=multiphase_params(gaits, config, robot),
+            swing=swing.SwingParams(
+                apex=jnp.asarray(np.where(is_bound, bound.apex, leg.apex)),
+                velocity_gain=jnp.asarray(
+                    np.where(is_bound, bound.velocity_gain, leg.velocity_gain)
+                ),
+                offset=jnp.asarray(is_bound[:, None] * _bound_offset(robot, config)),
+                horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
+                hold_after=jnp.asarray(leg.hold_after),
+                reach_speed=jnp.asarray(leg.reach_speed),
+                kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
+                kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
+            ),
+            lateral=lateral.LateralParams(
+                roll=jnp.asarray([sideways.roll_stiffness, sideways.roll_damping]),
+                yaw=jnp.asarray([sideways.yaw_stiffness, sideways.yaw_damping]),
+                damping=jnp.asarray(sideways.damping),
+                weights=jnp.asarray(sideways.wrench_weights),
+                ridge=jnp.asarray(sideways.force_weight),
+                friction=jnp.asarray(sideways.friction),
+                friction_offset=jnp.asarray(sideways.friction_offset),
+                friction_x=jnp.asarray(
+                    np.where(is_bound, sideways.plan_friction_bound, sideways.plan_friction)
+                ),
+                foothold_gain=jnp.asarray(sideways.velocity_gain),
+            ),
+            command=Command(
+                times=jnp.asarray(config.command.times),
+                velocities=jnp.asarray(config.command.velocities),
+            ),
+            height=jnp.asarray(np.where(is_bound, bound.height, config.lmpc.height)),
+            follow_ground=jnp.asarray(float(config.lmpc.height_above == "feet")),
+            command_slew=jnp.asarray(config.lmpc.command_slew, float),
+            integral=jnp.asarray([config.lmpc.integral_gains, config.lmpc.integral_limits]),
+            position_slack=jnp.asarray(config.lmpc.position_slack),
+        )
+        params = jax.device_get(params)
+    return jax.tree.map(lambda leaf: _as(leaf, dtype), params)
+
+
+_fit_modes = jax.jit(fit_modes, static_argnames="config")
+_build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon"))
+
+
+def build_gaits(config: RunConfig) -> list[gait.Gait]:
+    """The gaits of a config, in the order of their indices: trot, bound, stand, landing."""
+    chosen, bound = config.gait, config.bound
+    landing = "landing" if chosen.landing_time > 0 else ""
+    gaits = [
+        gait.trot(chosen.stance_time, chosen.trot_flight),
+        gait.bound(
+            bound.front_stance,
+            bound.first_flight,
+            bound.rear_stance,
+            bound.second_flight,
+            ramp_start=bound.ramp_start,
+            ramp_cycles=bound.ramp_cycles,
+            leave_anywhere=chosen.switch_rule == "anywhere",
+            leave_through=landing,
+        ),
+        gait.stand(),
+    ]
+    return [*gaits, gait.stand(chosen.landing_time, name=landing)] if landing else gaits
+
+
+def cycle_nodes(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
+    """Number of nodes (G, P) of each phase; zero for gaits that predict within a stance only."""
+    nodes = np.zeros((len(gaits), max(len(g.phases) for g in gaits)), int)
+    for index, one in enumerate(gaits):
+        if one.name != "bound" or config.bound.horizon != "multiphase":
+            continue
+        for place, phase in enumerate(one.phases):
+            parts = np.ceil(phase.duration / config.multiphase.node_dt - 1e-9)
+            nodes[index, place] = 1 if phase.mode == Mode.FLIGHT else parts
+    return nodes
+
+
+def multiphase_params(
+    gaits: list[gait.Gait], config: RunConfig, robot: RobotParams
+) -> multiphase.MultiPhaseParams:
+    """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
+    chosen, bound = config.multiphase, config.bound
+    return multiphase.MultiPhaseParams(
+        nodes=jnp.asarray(cycle_nodes(gaits, config)),
+        state_weights=jnp.asarray(chosen.state_weights),
+        input_weight=jnp.asarray(chosen.input_weight),
+        mass=jnp.asarray(config.srb.mass),
+        inertia=jnp.asarray(config.srb.inertia * chosen.inertia_scale),
+        friction=jnp.asarray(chosen.friction),
+        torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
+        force_x_max=jnp.asarray(chosen.force_x_max),
+        force_z=jnp.asarray([chosen.force_z_min, chosen.force_z_max]),
+        feet=jnp.asarray([bound.feet_front, -bound.feet_rear]),
+        velocity_gain=jnp.asarray(bound.velocity_gain),
+        velocity_time=jnp.asarray(chosen.velocity_time),
+        height_time=jnp.asarray(chosen.height_time),
+    )
+
+
+def _reference_tables(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
+    """Periodic motion of every gait at every ramp level; zero but for a bound that wants one."""
+    bound = config.bound
+    levels = 1 + max(g.ramp_cycles for g in gaits)
+    rows = np.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
+    for index, one in enumerate(gaits):
+        if one.name != "bound" or bound.reference != "periodic":
+            continue
+        modes = [phase.mode for phase in one.phases]
+        for level in range(levels):
+            rows[index, level] = periodic_reference(
+                np.array(one.durations(level)),
+                modes,
+                bound.feet_front,
+                bound.feet_rear,
+                config.srb.mass,
+                config.srb.inertia,
+            ).rows
+    return rows
+
+
+def _bound_offset(robot: RobotParams, config: RunConfig) -> np.ndarray:
+    """Foothold of a bound ahead of the hip, standing still, for each leg [m]."""
+    wanted = [config.bound.feet_front] * 2 + [-config.bound.feet_rear] * 2
+    return np.asarray(wanted) - np.asarray(robot.hip_pos)[:, 0]
+
+
+def _as(leaf: Any, dtype: Any) -> Array:
+    """Leaf on the device: floats in ``dtype``, integers as int32, the rest as it is."""
+    kind = jnp.asarray(leaf).dtype
+    if jnp.issubdtype(kind, jnp.floating):
+        return jnp.asarray(leaf, dtype)
+    return jnp.asarray(leaf, jnp.int32) if jnp.issubdtype(kind, jnp.integer) else jnp.asarray(leaf)

@@ -1,0 +1,236 @@
+"""From a place in the gait to forces: within the present stance, or over a whole gait cycle.
+
+Both take the same task and return the same plan, so that one program may hold both and each gait
+use its own.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from kjax import gait, qp
+from kjax.config import RunConfig
+from kjax.koopman.edmd import build_dictionary
+from kjax.legs.kinematics import PlanarState
+from kjax.mpc import multiphase
+from kjax.mpc.lmpc import reference_trajectory, shift_plan, solve_lmpc
+from kjax.params import ControllerParams, build_gaits, cycle_nodes
+from kjax.types import RobotParams
+
+
+class ForceTask(NamedTuple):
+    """What forces are to be planned for.
+
+    Attributes:
+      clock: place in the gait.
+      stance: (4,) legs that stand.
+      mode: contact mode.
+      body: the robot in the sagittal plane.
+      readable: whether that is what the robot does; else only a safe force is wanted.
+      position: reference of p_x now [m].
+      velocity: reference of v_x now [m/s].
+      command: velocity that the reference is on its way to [m/s].
+      height: of the centre of mass, mean of the stances, above z = 0 [m].
+      ground: height of the ground [m].
+      lean: correction of the pitch reference [rad].
+      last: (4k,) the last plan within a stance, body frame [N].
+    """
+
+    clock: gait.Clock
+    stance: Bool[Array, "4"]
+    mode: Int[Array, ""]
+    body: PlanarState
+    readable: Bool[Array, ""]
+    position: Float[Array, ""]
+    velocity: Float[Array, ""]
+    command: Float[Array, ""]
+    height: Float[Array, ""]
+    ground: Float[Array, ""]
+    lean: Float[Array, ""]
+    last: Float[Array, "nu"]
+
+
+class ForcePlan(NamedTuple):
+    """What comes back.
+
+    Attributes:
+      ends: (2, 2) force (x, z) per standing foot of the front and the rear, now, body frame [N].
+      steps: (4k,) forces of all steps within a stance; zeros from a plan over a cycle.
+      status: a ``qp.Status``.
+      residual: of the QP [-].
+      iterations: of the solver.
+      reference: (6,) state wanted one step ahead.
+    """
+
+    ends: Float[Array, "2 2"]
+    steps: Float[Array, "nu"]
+    status: Int[Array, ""]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    reference: Float[Array, "6"]
+
+
+Planner = Callable[[ControllerParams, ForceTask], ForcePlan]
+
+
+def build_planner(config: RunConfig) -> Planner:
+    """The planner of a config: each gait predicts as far as its parameters say."""
+    stance = _build_stance_planner(config)
+    count = int(cycle_nodes(build_gaits(config), config).sum(axis=1).max())
+    if count == 0:
+        return stance
+    # The present phase may hold one node more, part of them now and part a cycle later.
+    cycle = _build_cycle_planner(config, count + 1)
+
+    def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
+        foresees = params.multiphase.nodes[task.clock.gait].sum() > 0
+        return jax.lax.cond(foresees & task.stance.any(), cycle, stance, params, task)
+
+    return plan
+
+
+def _build_stance_planner(config: RunConfig) -> Planner:
+    """The paper's scheme: the present contact mode's lifted model, as if it lasted."""
+    lmpc = config.lmpc
+    lift = build_dictionary(config.koopman).lift
+    measured_feet = config.koopman.feet == "measured"
+
+    def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
+        clock, body = task.clock, task.body
+        ahead = lmpc.model_dt * jnp.arange(1, lmpc.horizon + 1, dtype=task.position.dtype)
+        phase, cycle = (jnp.broadcast_to(a, ahead.shape) for a in (clock.phase, clock.cycle))
+        reference = reference_trajectory(
+            position=task.position,
+            velocity=task.velocity,
+            height=task.height,
+            periodic=_motion(params, task, phase, cycle, clock.elapsed + ahead),
+            ahead=ahead,
+        )
+        warm = shift_plan(task.last, lmpc)
+        solution = solve_lmpc(
+            params.tables,
+            task.mode,
+            lift(body.x),
+            reference,
+            warm,
+            lmpc,
+            feet=_contacts(params.robot, task) @ body.rotation if measured_feet else None,
+        )
+        # Out of iterations, the solver's point is feasible and no worse than its start; only
+        # faulty data makes the shifted last plan the better choice.
+        usable = (solution.status <= qp.Status.ITERATION_LIMIT) & task.readable
+        fallback = jnp.clip(warm, params.tables.lower[task.mode], params.tables.upper[task.mode])
+        steps = jnp.where(usable, solution.x, fallback)
+        return ForcePlan(
+            ends=steps[:4].reshape(2, 2),
+            steps=steps,
+            status=solution.status,
+            residual=solution.residual,
+            iterations=solution.iterations,
+            reference=reference[0],
+        )
+
+    return plan
+
+
+def _build_cycle_planner(config: RunConfig, count: int) -> Planner:
+    """A gait cycle ahead, through flight and the next stances, on ``count`` nodes."""
+    shortest = 0.5 * config.lmpc.control_dt
+
+    def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
+        settings, schedule, clock, body = params.multiphase, params.schedule, task.clock, task.body
+        nodes = multiphase.build_nodes(settings, schedule, clock, count, shortest)
+        outlook = multiphase.predict(
+            settings,
+            nodes,
+            body.x,
+            position=task.position,
+            velocity=task.velocity,
+            command=task.command,
+            slew=params.command_slew,
+            height=task.height,
+            ground=task.ground,
+            periodic=_motion(params, task, nodes.phase, nodes.cycle, nodes.place),
+            contact=_contacts(params.robot, task) + body.x[:2],
+            stance_time=schedule.duration[clock.gait, nodes.phase],
+            cycle_time=nodes.end[-1],
+        )
+        solved = multiphase.solve(
+            settings,
+            params.robot,
+            nodes,
+            outlook,
+            body.x,
+            (body.x[:2] - body.base) @ body.rotation,
+            tolerance=config.multiphase.tolerance,
+            max_iterations=config.multiphase.max_iterations,
+        )
+        # A point that misses its rows by a percent still walks better than none; without one, the
+        # feet carry what they carry in the periodic motion.
+        usable = (solved.status <= qp.Status.ITERATION_LIMIT) & (solved.residual < 1e-2)
+        carry = jnp.stack([jnp.zeros_like(outlook.force_z[0]), outlook.force_z[0]])
+        force = jnp.where(usable & task.readable, solved.force[0], carry) @ body.rotation
+        standing = jnp.arange(2) == nodes.end_index[0]
+        return ForcePlan(
+            ends=jnp.where(standing[:, None], force, 0.0),
+            steps=jnp.zeros_like(task.last),
+            status=solved.status,
+            residual=solved.residual,
+            iterations=solved.iterations,
+            reference=outlook.reference[0],
+        )
+
+    return plan
+
+
+def _motion(
+    params: ControllerParams,
+    task: ForceTask,
+    phase: Int[Array, "k"],
+    cycle: Int[Array, "k"],
+    place: Float[Array, "k"],
+) -> Float[Array, "k 4"]:
+    """Deviation of p_z, theta, v_z, omega that is wanted: the gait's own, and the lean."""
+    rows = periodic_motion(params, task.clock.gait, phase, cycle, place)
+    return rows.at[:, 1].add(task.lean)
+
+
+def periodic_motion(
+    params: ControllerParams,
+    gait_index: Int[Array, ""],
+    phase: Int[Array, "*k"],
+    cycle: Int[Array, "*k"],
+    place: Float[Array, "*k"],
+) -> Float[Array, "*k 4"]:
+    """A gait's periodic motion, deviation of p_z, theta, v_z, omega; it stops at the phase's end.
+
+    Args:
+      params: of the controller.
+      gait_index: gait.
+      phase: index of the phase.
+      cycle: cycle that it belongs to.
+      place: time since its start [s].
+    """
+    levels, samples = params.reference.shape[1], params.reference.shape[3]
+    clock = gait.Clock(gait=gait_index, phase=phase, cycle=cycle, elapsed=place)
+    where = jnp.clip(place / gait.phase_duration(params.schedule, clock), 0.0, 1.0) * (samples - 1)
+    low = jnp.minimum(where.astype(jnp.int32), samples - 2)
+    part = (where - low)[..., None]
+    level = jnp.minimum(cycle, levels - 1)
+    at, after = (params.reference[gait_index, level, phase, i] for i in (low, low + 1))
+    return (1.0 - part) * at + part * after
+
+
+def _contacts(robot: RobotParams, task: ForceTask) -> Float[Array, "2 2"]:
+    """Mean contact point (x, z) of the stance feet at each end, world frame from the CoM [m].
+
+    An end without a stance foot gets its swing feet, which no force acts on.
+    """
+    sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+    ends = (task.body.feet - sole - task.body.x[:2]).reshape(2, 2, 2)
+    weight = task.stance.reshape(2, 2).astype(ends.dtype)
+    weight = jnp.where(weight.sum(axis=1, keepdims=True) > 0, weight, 1.0)
+    return (ends * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]
