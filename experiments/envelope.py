@@ -149,24 +149,14 @@ def main() -> None:
 
 
 def _parse() -> Namespace:
-    parser = cli.script_parser(__doc__.split("\n\n")[0])
-    parser.add_argument("--only", nargs="+", default=list(NAMES), metavar="NAME",
-                        help=f"of: {', '.join(NAMES)}")  # fmt: skip
-    parser.add_argument("--seeds", type=int, default=20, help="episodes per point")
-    parser.add_argument("--base", choices=("planar", "free", "both"), default="planar")
-    parser.add_argument("--jobs", type=int, default=2, help="worker processes, one core each")
-    parser.add_argument("--quick", action="store_true",
-                        help="2 seeds of 1.2 s, coarsely: to check the script")  # fmt: skip
-    args = parser.parse_args()
-    for name in args.only:
-        if name not in NAMES:
-            cli.fail(f"--only: got '{name}', wanted some of {', '.join(NAMES)}")
-    for key in ("seeds", "jobs"):
-        if getattr(args, key) < 1:
-            cli.fail(f"--{key}: got {getattr(args, key)}, wanted at least 1")
-    args.out = args.out or Path("results") / "envelope"
-    args.bases = ("planar", "free") if args.base == "both" else (args.base,)
-    return args
+    return cli.parse_study(
+        __doc__.split("\n\n")[0],
+        NAMES,
+        counts={"seeds": (20, "episodes per point")},
+        base="planar",
+        quick="2 seeds of 1.2 s, coarsely: to check the script",
+        default_out="envelope",
+    )
 
 
 def _kept(path: Path, code: str, args: Namespace) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Run everything that the paper publishes and set it beside its numbers and our targets.
 
 Leaves results.json, table.md, index.html and figures/ in the output folder. Every finished episode
-is kept there: the same command goes on after Ctrl-C, and does nothing when all is done. The whole
-takes about 10 minutes on two quiet cores (planar); experiments/paper_results.py says what is run.
+is kept there: the same command goes on after Ctrl-C, and does nothing when all is done. Both bases
+take about 40 minutes on two quiet cores; experiments/paper_results.py says what is run.
 """
 
 import json
@@ -73,24 +73,17 @@ def main() -> None:
 
 
 def _parse() -> Namespace:
-    parser = cli.script_parser(__doc__.split("\n\n")[0])
-    parser.add_argument("--only", nargs="+", default=list(NAMES), metavar="NAME",
-                        help=f"of: {', '.join(NAMES)}")  # fmt: skip
-    parser.add_argument("--seeds", type=int, default=16, help="episodes on flat ground")
-    parser.add_argument("--terrains", type=int, default=64, help="episodes on rough ground")
-    parser.add_argument("--base", choices=("planar", "free", "both"), default="both")
-    parser.add_argument("--jobs", type=int, default=2, help="worker processes, one core each")
-    parser.add_argument("--quick", action="store_true",
-                        help="2 episodes of 1.5 s each: to check the script")  # fmt: skip
-    args = parser.parse_args()
-    for name in args.only:
-        if name not in NAMES:
-            cli.fail(f"--only: got '{name}', wanted some of {', '.join(NAMES)}")
-    for key in ("seeds", "terrains", "jobs"):
-        if getattr(args, key) < 1:
-            cli.fail(f"--{key}: got {getattr(args, key)}, wanted at least 1")
-    args.out = args.out or Path("results") / "reproduce"
-    args.bases = ("planar", "free") if args.base == "both" else (args.base,)
+    args = cli.parse_study(
+        __doc__.split("\n\n")[0],
+        NAMES,
+        counts={
+            "seeds": (16, "episodes on flat ground"),
+            "terrains": (64, "episodes on rough ground"),
+        },
+        base="both",
+        quick="2 episodes of 1.5 s each: to check the script",
+        default_out="reproduce",
+    )
     if args.quick:
         args.seeds, args.terrains = min(args.seeds, 2), min(args.terrains, 2)
     return args

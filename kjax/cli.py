@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tomllib
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -58,6 +58,48 @@ def script_parser(description: str) -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, help="output folder")
     parser.set_defaults(config=None)
     return parser
+
+
+def parse_study(
+    description: str,
+    names: Sequence[str],
+    *,
+    counts: Mapping[str, tuple[int, str]],
+    base: str,
+    quick: str,
+    default_out: str,
+) -> argparse.Namespace:
+    """Command line of a script that runs many episodes; a mistake ends the program.
+
+    Args:
+      description: of the script.
+      names: of its parts, for ``--only``.
+      counts: options that are whole numbers from 1 on: default and help.
+      base: default of ``--base``.
+      quick: help of ``--quick``.
+      default_out: folder in results/.
+
+    Returns:
+      The options; ``bases`` lists those that are asked for.
+    """
+    parser = script_parser(description)
+    parser.add_argument("--only", nargs="+", default=list(names), metavar="NAME",
+                        help=f"of: {', '.join(names)}")  # fmt: skip
+    whole = {**counts, "jobs": (2, "worker processes, one core each")}
+    for name, (default, text) in whole.items():
+        parser.add_argument(f"--{name}", type=int, default=default, help=text)
+    parser.add_argument("--base", choices=("planar", "free", "both"), default=base)
+    parser.add_argument("--quick", action="store_true", help=quick)
+    args = parser.parse_args()
+    for name in args.only:
+        if name not in names:
+            fail(f"--only: got '{name}', wanted some of {', '.join(names)}")
+    for name in whole:
+        if getattr(args, name) < 1:
+            fail(f"--{name}: got {getattr(args, name)}, wanted at least 1")
+    args.out = args.out or Path("results") / default_out
+    args.bases = ("planar", "free") if args.base == "both" else (args.base,)
+    return args
 
 
 def build_parser(cls: type, description: str) -> argparse.ArgumentParser:

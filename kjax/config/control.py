@@ -165,25 +165,25 @@ class MultiPhaseConfig:
     """Longest node of a stance; a flight is one node [s]."""
     state_weights: tuple[
         NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
-    ] = (32.6, 95.3, 12.9, 50.7, 1.59, 0.323)
+    ] = (63.6, 190.0, 10.4, 29.0, 1.57, 0.22)
     """Q of (p_x, p_z, theta, v_x, v_z, omega), per second [1/s times that of bound]."""
-    input_weight: Positive = 1.64e-5
+    input_weight: Positive = 5.26e-5
     """R of every force's distance from the periodic one, per second [1/(N^2 s)]."""
-    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 80.0
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 90.0
     """Bound of |F_x| per leg, world frame [N]."""
     force_z_min: Bound = 10.0
     """Lower bound of F_z per leg, world frame [N]."""
-    force_z_max: Bound = 305.0
+    force_z_max: Bound = 340.0
     """Upper bound of F_z per leg, world frame [N]."""
-    friction: Positive = 0.72
+    friction: Positive = 0.7
     """mu of the pyramid |F_x| <= mu F_z; below the ground's, for margin [-]."""
     torque_fraction: Annotated[float, Field(gt=0, le=1)] = 0.95
     """Part of the thigh's and the calf's torque limit that planned forces may take [-]."""
-    inertia_scale: Positive = 0.883
+    inertia_scale: Positive = 0.937
     """Pitch inertia of the prediction over srb.inertia: legs in swing count for less [-]."""
-    velocity_time: Positive = 0.51
+    velocity_time: Positive = 0.38
     """Time in which the velocity is predicted to reach its reference, for moment arms [s]."""
-    height_time: Positive = 0.16
+    height_time: Positive = 0.095
     """The same of height and pitch [s]."""
     tolerance: Positive = 1e-6
     """Relative residuals and gap at which the QP counts as solved [-]."""
