@@ -2,6 +2,8 @@
 
 controller: latency of plan and act in the single-robot loop, beside an empty jitted call of the
 same signature and the bare physics step; real-time factor; first and second start of the main job.
+qp: the QP solvers on the QPs of closed loops, beside daqp, quadprog, OSQP, ProxQP, PIQP, Clarabel,
+qpSWIFT and qpax, as far as these are installed; single, in a scan and batched.
 """
 
 import json
@@ -17,6 +19,7 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
+import qp_benchmark
 
 from kjax import cli
 from kjax.config import RunConfig
@@ -24,7 +27,7 @@ from kjax.sim.episode import initial_state, metrics
 from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
 from kjax.sim.observe import noise_dim
 
-BENCHMARKS = ("controller",)
+BENCHMARKS = ("controller", "qp")
 CALLS = 2000  # timed calls of each function
 WALK = 400  # ms of walking from which the timed inputs are taken
 
@@ -34,6 +37,9 @@ def main() -> None:
     words = sys.argv[1:]
     if not words or words[0] not in (*BENCHMARKS, "-h", "--help"):
         cli.fail(f"which benchmark? one of: {', '.join(BENCHMARKS)}")
+    if words[0] == "qp":
+        qp_solvers(words[1:])
+        return
     parser = cli.build_parser(RunConfig, __doc__)
     parser.prog = f"benchmark.py {words[0]}"
     parser.add_argument("--no-startup", action="store_true", help="leave out the start-up times")
@@ -49,6 +55,22 @@ def main() -> None:
         print(f"{key:32}{value:12.4g}")
     record = {"config": args.config, "provenance": cli.provenance(), **result}
     cli.save_json(folder / "metrics.json", record)
+    print(f"results in {folder}/")
+
+
+def qp_solvers(words: list[str]) -> None:
+    """The solvers beside their peers; see qp_benchmark.py."""
+    parser = cli.script_parser(__doc__)
+    parser.prog = "benchmark.py qp"
+    parser.add_argument("--quick", action="store_true", help="1 s of walking, small batches")
+    args = parser.parse_args(words)
+    args.out = args.out or Path("results") / "benchmark_qp"
+    args.config = None
+    folder = cli.output_folder(args, "benchmark_qp")
+    cli.configure_jax(one_core=True)
+    result = qp_benchmark.run(folder, quick=args.quick)
+    qp_benchmark.save(folder, result)
+    print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"results in {folder}/")
 
 

@@ -17,8 +17,9 @@ from kjax import gait, qp
 from kjax.config import RunConfig
 from kjax.legs import lateral, swing
 from kjax.legs.base import LegCommand, build_base
+from kjax.mpc.lmpc import LmpcMemory, start_memory
 from kjax.params import ControllerParams
-from kjax.planning import ForceTask, build_planner, periodic_motion
+from kjax.planning import ForceTask, Planner, build_planner, periodic_motion
 from kjax.types import Observation
 
 
@@ -35,7 +36,7 @@ class ControllerState(NamedTuple):
       velocity: reference of v_x, which follows the command at a bounded rate [m/s].
       correction: integrals of the errors of velocity and pitch, added to their references
         [m/s, rad].
-      plan: (4k,) last force plan, body frame [N].
+      memory: of the LMPC within a stance: its last plan and where the QP goes on from.
       force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
       swing: state of the swing legs.
       track: (2,) cosine and sine of the heading to keep, the trunk's at ``init``, world [-];
@@ -50,7 +51,7 @@ class ControllerState(NamedTuple):
     ground: Float[Array, ""]
     velocity: Float[Array, ""]
     correction: Float[Array, "2"]
-    plan: Float[Array, "nu"]
+    memory: LmpcMemory
     force: Float[Array, "4 2"]
     swing: swing.SwingState
     track: Float[Array, "2"] | None
@@ -102,12 +103,17 @@ class Controller(NamedTuple):
     ]
 
 
-def build_controller(config: RunConfig) -> Controller:
-    """Controller functions for the static choices of a config (rates, horizon, solver)."""
+def build_controller(config: RunConfig, planner: Planner | None = None) -> Controller:
+    """Controller functions for the static choices of a config (rates, horizon, solver).
+
+    Args:
+      config: of the run.
+      planner: of forces; that of the config if ``None``.
+    """
     lmpc = config.lmpc
     sim_dt = config.sim.sim_dt
     base = build_base(config.sim.base)
-    plan_forces = build_planner(config)
+    plan_forces = build_planner(config) if planner is None else planner
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
         observation = _cast(observation, params)
@@ -123,7 +129,7 @@ def build_controller(config: RunConfig) -> Controller:
             ground=zero,
             velocity=zero,
             correction=jnp.zeros((2,), zero.dtype),
-            plan=jnp.zeros_like(params.tables.lower[0]),
+            memory=start_memory(params.tables, lmpc, carry=config.koopman.feet == "fixed"),
             force=jnp.zeros((4, 2), zero.dtype),
             swing=swing.initial_swing(view.feet),
             track=track,
@@ -184,7 +190,7 @@ def build_controller(config: RunConfig) -> Controller:
                 height=params.height[clock.gait] + params.follow_ground * ground,
                 ground=ground,
                 lean=correction[1],
-                last=state.plan,
+                memory=state.memory,
             ),
         )
 
@@ -197,7 +203,7 @@ def build_controller(config: RunConfig) -> Controller:
             ground=jnp.where(readable, ground, state.ground),
             velocity=velocity,
             correction=jnp.where(readable, correction, state.correction),
-            plan=solved.steps,
+            memory=solved.memory,
             force=jnp.broadcast_to(solved.ends[:, None], (2, 2, 2)).reshape(4, 2) * stance[:, None],
             swing=jax.tree.map(lambda new, old: jnp.where(readable, new, old), swings, state.swing),
             track=state.track,

@@ -5,6 +5,7 @@ use its own.
 """
 
 from collections.abc import Callable
+from math import inf
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,8 @@ from kjax.config import RunConfig
 from kjax.koopman.edmd import build_dictionary
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc import multiphase
-from kjax.mpc.lmpc import reference_trajectory, shift_plan, solve_lmpc
+from kjax.mpc.limits import force_limits
+from kjax.mpc.lmpc import LmpcMemory, reference_trajectory, shift_plan, solve_lmpc
 from kjax.params import ControllerParams, build_gaits, cycle_nodes
 from kjax.types import RobotParams
 
@@ -36,7 +38,7 @@ class ForceTask(NamedTuple):
       height: of the centre of mass, mean of the stances, above z = 0 [m].
       ground: height of the ground [m].
       lean: correction of the pitch reference [rad].
-      last: (4k,) the last plan within a stance, body frame [N].
+      memory: of the LMPC within a stance.
     """
 
     clock: gait.Clock
@@ -50,7 +52,7 @@ class ForceTask(NamedTuple):
     height: Float[Array, ""]
     ground: Float[Array, ""]
     lean: Float[Array, ""]
-    last: Float[Array, "nu"]
+    memory: LmpcMemory
 
 
 class ForcePlan(NamedTuple):
@@ -58,7 +60,7 @@ class ForcePlan(NamedTuple):
 
     Attributes:
       ends: (2, 2) force (x, z) per standing foot of the front and the rear, now, body frame [N].
-      steps: (4k,) forces of all steps within a stance; zeros from a plan over a cycle.
+      memory: of the LMPC within a stance, for the next tick.
       status: a ``qp.Status``.
       residual: of the QP [-].
       iterations: of the solver.
@@ -66,7 +68,7 @@ class ForcePlan(NamedTuple):
     """
 
     ends: Float[Array, "2 2"]
-    steps: Float[Array, "nu"]
+    memory: LmpcMemory
     status: Int[Array, ""]
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -97,6 +99,7 @@ def _build_stance_planner(config: RunConfig) -> Planner:
     lmpc = config.lmpc
     lift = build_dictionary(config.koopman).lift
     measured_feet = config.koopman.feet == "measured"
+    limited = min(lmpc.friction, lmpc.torque_fraction) < inf
 
     def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
         clock, body = task.clock, task.body
@@ -109,24 +112,38 @@ def _build_stance_planner(config: RunConfig) -> Planner:
             periodic=_motion(params, task, phase, cycle, clock.elapsed + ahead),
             ahead=ahead,
         )
-        warm = shift_plan(task.last, lmpc)
+        feet = _contacts(params.robot, task) @ body.rotation
+        rows = None
+        if limited:
+            rows = force_limits(
+                params.robot,
+                body.trig,
+                task.stance,
+                friction=lmpc.friction,
+                torque_fraction=lmpc.torque_fraction,
+            )
         solution = solve_lmpc(
             params.tables,
             task.mode,
             lift(body.x),
             reference,
-            warm,
+            task.memory,
             lmpc,
-            feet=_contacts(params.robot, task) @ body.rotation if measured_feet else None,
+            feet=feet if measured_feet else None,
+            rows=rows,
         )
         # Out of iterations, the solver's point is feasible and no worse than its start; only
         # faulty data makes the shifted last plan the better choice.
         usable = (solution.status <= qp.Status.ITERATION_LIMIT) & task.readable
-        fallback = jnp.clip(warm, params.tables.lower[task.mode], params.tables.upper[task.mode])
-        steps = jnp.where(usable, solution.x, fallback)
+        fallback = jnp.clip(
+            shift_plan(task.memory.plan, lmpc),
+            params.tables.lower[task.mode],
+            params.tables.upper[task.mode],
+        )
+        steps = jnp.where(usable, solution.plan, fallback)
         return ForcePlan(
             ends=steps[:4].reshape(2, 2),
-            steps=steps,
+            memory=LmpcMemory(plan=steps, mode=task.mode, warm=solution.warm),
             status=solution.status,
             residual=solution.residual,
             iterations=solution.iterations,
@@ -176,7 +193,7 @@ def _build_cycle_planner(config: RunConfig, count: int) -> Planner:
         standing = jnp.arange(2) == nodes.end_index[0]
         return ForcePlan(
             ends=jnp.where(standing[:, None], force, 0.0),
-            steps=jnp.zeros_like(task.last),
+            memory=task.memory._replace(plan=jnp.zeros_like(task.memory.plan)),
             status=solved.status,
             residual=solved.residual,
             iterations=solved.iterations,

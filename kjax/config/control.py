@@ -68,12 +68,18 @@ class LmpcConfig:
     """Largest correction of velocity and pitch reference by that [m/s, rad]."""
     position_slack: Positive = 0.10
     """Largest lead or lag of the integrated position reference before the body [m]."""
-    solver: Literal["admm", "projected_gradient"] = "admm"
-    """Method of the box QP [-]."""
-    tolerance: Positive = 1e-6
-    """Relative KKT residual at which the QP counts as solved [-]."""
+    solver: Literal["tableau", "admm", "projected_gradient"] = "tableau"
+    """Method of the box QP; the first is exact [-]."""
+    warm_start: bool = True
+    """Carry the tableau from tick to tick; without, a batch of robots keeps a smaller state [-]."""
+    tolerance: Positive = 1e-9
+    """Relative KKT residual at which the QP counts as solved; floored by float32's rounding [-]."""
     max_iterations: Count = 2000
     """Iteration limit of the QP [-]."""
+    friction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = inf
+    """mu of rows |F_x| <= mu F_z within a stance, body frame; inf for the paper's box alone [-]."""
+    torque_fraction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = inf
+    """Part of the joint torque limits that planned forces may take, as rows; inf for none [-]."""
 
     @model_validator(mode="after")
     def _check(self) -> "LmpcConfig":

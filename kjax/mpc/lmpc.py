@@ -9,12 +9,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from kjax import qp
 from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman.models import LinearModel, aggregate, input_map
 from kjax.mpc.condense import condense
+from kjax.mpc.limits import ForceRows
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 
@@ -42,6 +43,20 @@ class LmpcTables(NamedTuple):
     model: LinearModel
     state_weights: Float[Array, "M 6"]
     input_weights: Float[Array, "M 4"]
+
+
+class LmpcMemory(NamedTuple):
+    """What the LMPC carries from tick to tick.
+
+    Attributes:
+      plan: (4k,) last force plan, body frame [N].
+      mode: contact mode that it was made in; -1 before the first.
+      warm: where the QP of that mode may go on from; ``None`` where nothing is carried.
+    """
+
+    plan: Float[Array, "nu"]
+    mode: Int[Array, ""]
+    warm: qp.Warm | None
 
 
 class ModeSettings(NamedTuple):
@@ -104,13 +119,15 @@ def build_tables(
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
     Q, R, lower, upper, u_ref = (jnp.asarray(value) for value in settings)
 
+    swinging = jnp.tile(lower == upper, (1, horizon))
+
     def one(
-        model: LinearModel, Q: Array, R: Array, feet: Array
+        model: LinearModel, Q: Array, R: Array, feet: Array, swinging: Array
     ) -> tuple[qp.Prepared, Array, Array]:
         problem = condense(model.A, input_map(model, feet), Q, R, horizon)
-        return qp.prepare(problem.H), problem.F, problem.G
+        return qp.prepare(problem.H, swinging), problem.F, problem.G
 
-    hessian, F, G = jax.vmap(one)(model, Q, R, feet)
+    hessian, F, G = jax.vmap(one)(model, Q, R, feet, swinging)
     return LmpcTables(
         hessian=hessian,
         F=F,
@@ -146,50 +163,111 @@ def reference_trajectory(
     return jnp.stack([position + velocity * ahead, height + z, theta, forward, v_z, omega], -1)
 
 
+class LmpcSolution(NamedTuple):
+    """Result of ``solve_lmpc``.
+
+    Attributes:
+      plan: (4k,) forces, four per step, body frame [N].
+      status: a ``qp.Status``.
+      residual: relative, of the QP [-].
+      iterations: of the solver.
+      warm: for the next tick in the same mode; ``None`` where nothing is carried.
+    """
+
+    plan: Float[Array, "nu"]
+    status: Int[Array, ""]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    warm: qp.Warm | None
+
+
+def start_memory(tables: LmpcTables, config: LmpcConfig, *, carry: bool) -> LmpcMemory:
+    """Memory before the first tick; ``carry`` where the Hessian of a mode stays what it is."""
+    warm = None
+    if carry and config.warm_start and config.solver == "tableau":
+        warm = qp.start(jax.tree.map(lambda a: a[0], tables.hessian))
+    return LmpcMemory(
+        plan=jnp.zeros_like(tables.lower[0]), mode=jnp.full((), -1, jnp.int32), warm=warm
+    )
+
+
 def solve_lmpc(
     tables: LmpcTables,
-    mode: Array,
+    mode: Int[Array, ""],
     z: Float[Array, "N"],
     reference: Float[Array, "k 6"],
-    warm: Float[Array, "nu"],
+    memory: LmpcMemory,
     config: LmpcConfig,
     feet: Float[Array, "2 2"] | None = None,
-) -> qp.Solution:
-    """Force plan: ``x`` of the solution is (4k,), four forces per step, body frame [N].
+    rows: ForceRows | None = None,
+) -> LmpcSolution:
+    """Force plan of one tick.
 
     Args:
       tables: of all modes.
       mode: contact mode, an index; traced.
       z: lifted state Pi(x).
       reference: (k, 6) states wanted.
-      warm: (4k,) starting point [N].
+      memory: of the last tick.
       config: solver settings (static).
       feet: (2, 2) measured contact points [m]; ``None`` uses the tables' own.
+      rows: on the forces of every step, besides the box.
     """
-    stacked = tables if feet is not None else tables._replace(model=None)  # type: ignore[arg-type]
-    now = jax.tree.map(lambda a: a[mode], stacked)
+    lower, upper = tables.lower[mode], tables.upper[mode]
     if feet is None:
-        hessian, F, G = now.hessian, now.F, now.G
+        hessian, index, F, G = tables.hessian, mode, tables.F[mode], tables.G[mode]
     else:
-        problem = condense(
-            now.model.A,
-            input_map(now.model, feet),
-            now.state_weights,
-            now.input_weights,
-            config.horizon,
+        model = jax.tree.map(lambda a: a[mode], tables.model)
+        weights = tables.state_weights[mode], tables.input_weights[mode]
+        problem = condense(model.A, input_map(model, feet), *weights, config.horizon)
+        hessian, index = qp.prepare(problem.H, lower == upper), None
+        F, G = problem.F, problem.G
+    q = F @ z - G @ reference.reshape(-1) + tables.q_input[mode]
+
+    if rows is not None:
+        now = hessian if index is None else jax.tree.map(lambda a: a[index], hessian)
+        H = now.H / (now.scale[:, None] * now.scale)
+        C = jnp.kron(jnp.eye(config.horizon, dtype=q.dtype), rows.A)
+        solved = qp.solve_rows(
+            H,
+            q,
+            C,
+            jnp.tile(rows.low, config.horizon),
+            jnp.tile(rows.high, config.horizon),
+            lower,
+            upper,
+            method="active_set",
+            tolerance=config.tolerance,
+            max_iterations=config.max_iterations,
         )
-        hessian, F, G = qp.prepare(problem.H), problem.F, problem.G
-    q = F @ z - G @ reference.reshape(-1) + now.q_input
-    return qp.solve(
+        worst = jnp.maximum(jnp.maximum(solved.primal, solved.dual), solved.gap)
+        return LmpcSolution(solved.x, solved.status, worst, solved.iterations, memory.warm)
+
+    warm: qp.Warm | Array | None = memory.warm
+    if memory.warm is not None:
+        # Another mode is another Hessian: its own cold start then.
+        cold = (tables.hessian.table[mode], tables.hessian.side[mode])
+        table, side = jax.tree.map(
+            lambda old, new: jnp.where(mode == memory.mode, old, new),
+            (memory.warm.table, memory.warm.side),
+            cold,
+        )
+        warm = qp.Warm(x=memory.warm.x, table=table, side=side)
+    elif config.solver != "tableau":
+        warm = shift_plan(memory.plan, config)
+    solution = qp.solve(
         hessian,
         q,
-        now.lower,
-        now.upper,
+        lower,
+        upper,
         warm,
+        index=index,
         method=config.solver,
         tolerance=config.tolerance,
         max_iterations=config.max_iterations,
     )
+    kept = None if memory.warm is None else solution.warm
+    return LmpcSolution(solution.x, solution.status, solution.residual, solution.iterations, kept)
 
 
 def shift_plan(plan: Float[Array, "nu"], config: LmpcConfig) -> Float[Array, "nu"]:

@@ -299,6 +299,7 @@ def solve(
         limit.reshape(-1),
         lower,
         upper,
+        method="active_set",
         tolerance=tolerance,
         max_iterations=max_iterations,
     )

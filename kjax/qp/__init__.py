@@ -1,24 +1,32 @@
 """Convex quadratic programs with a box, or with general rows; this package knows no robot."""
 
-from kjax.qp.interior import RowSolution, solve_rows
+from kjax.qp.box import METHODS, Method, solve
 from kjax.qp.problem import (
     STATUS_TEXT,
     Prepared,
     Solution,
     Status,
+    Warm,
     kkt_residual,
     prepare,
+    start,
 )
-from kjax.qp.solvers import solve
+from kjax.qp.rows import ROW_METHODS, RowMethod, RowSolution, solve_rows
 
 __all__ = [
+    "METHODS",
+    "ROW_METHODS",
     "STATUS_TEXT",
+    "Method",
     "Prepared",
+    "RowMethod",
     "RowSolution",
     "Solution",
     "Status",
+    "Warm",
     "kkt_residual",
     "prepare",
     "solve",
     "solve_rows",
+    "start",
 ]

@@ -11,6 +11,7 @@ the unit of x does.
 from enum import IntEnum
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -23,6 +24,7 @@ class Status(IntEnum):
     INFEASIBLE_BOUNDS = 2
     NON_FINITE = 3
     NOT_POSITIVE_DEFINITE = 4
+    INFEASIBLE = 5
 
 
 STATUS_TEXT = {
@@ -31,6 +33,7 @@ STATUS_TEXT = {
     Status.INFEASIBLE_BOUNDS: "a lower bound exceeds its upper bound, or is +inf, or upper is -inf",
     Status.NON_FINITE: "H, q or a bound holds NaN, or H or q infinity",
     Status.NOT_POSITIVE_DEFINITE: "H is not positive definite to working precision",
+    Status.INFEASIBLE: "no point keeps all rows and bounds",
 }
 
 
@@ -40,24 +43,48 @@ class Prepared(NamedTuple):
     Attributes:
       H: (n, n) Jacobi-scaled Hessian, unit diagonal [-].
       scale: (n,) d, with x = d x_hat.
+      table: (n, n) tableau that a cold start pivots from, see ``qp.tableau``; H^-1 where no
+        variable is known to be fixed [-].
+      side: (n,) -1 where a variable is known to be fixed, else 0.
+      inverse: (n, n) H^-1 [-].
       eig_min: smallest eigenvalue of the scaled Hessian [-].
       eig_max: largest one [-].
       rho: ADMM's penalty, sqrt(eig_min eig_max) [-].
       resolvent: (n, n) (H + rho I)^-1 [-].
-      inverse: (n, n) H^-1 [-].
       finite: whether H is finite.
       definite: whether H is positive definite to working precision.
     """
 
     H: Float[Array, "n n"]
     scale: Float[Array, "n"]
+    table: Float[Array, "n n"]
+    side: Int[Array, "n"]
+    inverse: Float[Array, "n n"]
     eig_min: Float[Array, ""]
     eig_max: Float[Array, ""]
     rho: Float[Array, ""]
     resolvent: Float[Array, "n n"]
-    inverse: Float[Array, "n n"]
     finite: Bool[Array, ""]
     definite: Bool[Array, ""]
+
+    @property
+    def condition(self) -> Float[Array, ""]:
+        """Condition number of the scaled Hessian [-]."""
+        return self.eig_max / self.eig_min
+
+
+class Warm(NamedTuple):
+    """Where the next solve with the same ``Prepared`` may start; data, to be carried.
+
+    Attributes:
+      x: (n,) point.
+      table: (n, n) tableau swept on the free variables.
+      side: (n,) -1 at the lower bound, 0 free, 1 at the upper bound.
+    """
+
+    x: Float[Array, "n"]
+    table: Float[Array, "n n"]
+    side: Int[Array, "n"]
 
 
 class Solution(NamedTuple):
@@ -65,21 +92,42 @@ class Solution(NamedTuple):
 
     Attributes:
       x: (n,) minimiser, always within the bounds where these are consistent.
+      multipliers: (n,) y with H x + q + y = 0: positive at upper, negative at lower bounds.
       status: a ``Status``; nothing but ``SOLVED`` may be trusted to the tolerance.
       residual: relative KKT residual of ``x`` (see ``kkt_residual``) [-].
+      primal: largest violation of a bound, relative; 0, as x is clipped [-].
+      dual: residual of the equation of the multipliers, relative [-].
+      gap: sum of |y| times the distance from its bound, relative to the objective's terms; 0, as
+        multipliers belong to bounds that x is at [-].
+      margin: smallest of every bound variable's |gradient| and every free variable's distance from
+        a bound, relative; where it is near 0 a bound is weakly active, and the derivative is that
+        of one side [-].
       iterations: number of iterations spent.
+      warm: where to go on from.
     """
 
     x: Float[Array, "n"]
+    multipliers: Float[Array, "n"]
     status: Int[Array, ""]
     residual: Float[Array, ""]
+    primal: Float[Array, ""]
+    dual: Float[Array, ""]
+    gap: Float[Array, ""]
+    margin: Float[Array, ""]
     iterations: Int[Array, ""]
+    warm: Warm
 
 
-def prepare(H: Float[Array, "n n"]) -> Prepared:
-    """Scaling, spectrum and ADMM resolvent of a Hessian (its symmetric part is used).
+def prepare(H: Float[Array, "n n"], fixed: Bool[Array, "n"] | None = None) -> Prepared:
+    """Scaling, inverse and spectrum of a Hessian (its symmetric part is used).
 
-    Traceable and ``vmap``-able; for a constant H call it once, in float64.
+    Traceable, ``vmap``-able and differentiable; for a constant H call it once, in float64. What a
+    solver does not use is not computed inside ``jit``.
+
+    Args:
+      H: (n, n) symmetric positive definite.
+      fixed: (n,) variables whose bounds will be equal: a cold start then begins with them fixed.
+        A hint, not a promise.
     """
     n = H.shape[-1]
     finite = jnp.isfinite(H).all()
@@ -88,24 +136,48 @@ def prepare(H: Float[Array, "n n"]) -> Prepared:
     usable = finite & positive
     # A harmless stand-in keeps the branch that nobody will read free of NaN.
     safe = jnp.where(usable, 0.5 * (H + H.T), jnp.eye(n, dtype=H.dtype))
-    scale = 1.0 / jnp.sqrt(jnp.diagonal(safe))
+    # The scaling is a choice, not a part of the problem: no derivative goes through it.
+    scale = jax.lax.stop_gradient(1.0 / jnp.sqrt(jnp.diagonal(safe)))
     scaled = safe * scale[:, None] * scale[None, :]
-    eigenvalues, vectors = jnp.linalg.eigh(scaled)
+    constant = jax.lax.stop_gradient(scaled)
+    eigenvalues, vectors = jnp.linalg.eigh(constant)
     floor = n * jnp.finfo(H.dtype).eps * eigenvalues[-1]
     definite = positive & (eigenvalues[0] > floor)
     eigenvalues = jnp.maximum(eigenvalues, floor)
     rho = jnp.sqrt(eigenvalues[0] * eigenvalues[-1])
+    inverse = (vectors / eigenvalues) @ vectors.T
+    side = jnp.zeros((n,), jnp.int32) if fixed is None else -fixed.astype(jnp.int32)
     return Prepared(
         H=scaled,
         scale=scale,
+        table=inverse if fixed is None else swept(constant, side == 0),
+        side=side,
+        inverse=inverse,
         eig_min=eigenvalues[0],
         eig_max=eigenvalues[-1],
         rho=rho,
         resolvent=(vectors / (eigenvalues + rho)) @ vectors.T,
-        inverse=(vectors / eigenvalues) @ vectors.T,
         finite=finite,
         definite=definite | ~finite,
     )
+
+
+def start(prepared: Prepared) -> Warm:
+    """The cold start, as something to carry."""
+    return Warm(x=jnp.zeros_like(prepared.scale), table=prepared.table, side=prepared.side)
+
+
+def swept(H: Float[Array, "n n"], free: Bool[Array, "n"]) -> Float[Array, "n n"]:
+    """Tableau of H swept on the free variables, from scratch; see ``qp.tableau``."""
+    n = H.shape[-1]
+    both, neither = (jnp.outer(a, a).astype(H.dtype) for a in (free, ~free))
+    # Bound variables get a unit diagonal of their own, so that one factorisation does for all.
+    factor = jnp.linalg.cholesky(H * both + jnp.diag((~free).astype(H.dtype)))
+    half = jax.scipy.linalg.solve_triangular(factor, jnp.eye(n, dtype=H.dtype), lower=True)
+    inverse = both * (half.T @ half)
+    right = inverse @ H
+    cross = jnp.outer(free, ~free).astype(H.dtype) * right
+    return inverse - cross + cross.T + neither * (H - H @ right)
 
 
 def kkt_residual(

@@ -11,8 +11,11 @@ import pytest
 from kjax import srb
 from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman import models, observables
+from kjax.legs.kinematics import LegTrig
 from kjax.mpc import lmpc
+from kjax.mpc.limits import force_limits
 from kjax.qp import Status
+from kjax.robots import go1
 from kjax.types import MODE_ALPHA, Mode
 
 DT = 1e-3  # s, step of the fitted models
@@ -92,6 +95,11 @@ def start():
     return x, reference
 
 
+def memory(dtype="float64"):
+    """Nothing remembered."""
+    return lmpc.LmpcMemory(plan=jnp.zeros(16, dtype), mode=jnp.asarray(-1, jnp.int32), warm=None)
+
+
 def horizon_by_hand(model, mode, config, x):
     """Free response and forced response of the states over the horizon, by stepping in numpy."""
     A, B = np.asarray(model.A[mode]), np.asarray(model.B[mode])
@@ -117,7 +125,7 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
     Each mode with its own weights, and with the forces of its stance legs only.
     """
     x, reference = start
-    plan = solve(free, jnp.asarray(int(mode)), lift(x), reference, jnp.zeros(16), config=FREE)
+    plan = solve(free, jnp.asarray(int(mode)), lift(x), reference, memory(), config=FREE)
     assert plan.status == Status.SOLVED
     response, forced = horizon_by_hand(model, mode, FREE, x)
     own = FREE_BOUND if mode in (Mode.FRONT, Mode.REAR) else FREE
@@ -133,7 +141,7 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
     # Rounding 2e-16 times the condition of H, 1e5, times forces of 1e3 N. An end that is fixed to
     # zero makes the solver iterate: tolerance times condition times forces, seen 100 times less.
     atol = 1e-6 if mode in (Mode.FRONT, Mode.REAR) else 2e-8
-    np.testing.assert_allclose(plan.x, u, rtol=0, atol=atol)
+    np.testing.assert_allclose(plan.plan, u, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("mode", list(Mode))
@@ -145,9 +153,9 @@ def test_plans_respect_the_bounds_and_swing_legs_get_exactly_no_force(mode, name
     for scale in (1.0, 30.0):  # the larger disturbance drives every force to a bound
         x, reference = (jnp.asarray(a, name) for a in start)
         z = lift(scale * (x - reference[0]) + reference[0])
-        solution = solve(tables, jnp.asarray(int(mode)), z, reference, 0 * tables.lower[0], config)
+        solution = solve(tables, jnp.asarray(int(mode)), z, reference, memory(name), config)
         assert solution.status == Status.SOLVED
-        forces = np.asarray(solution.x).reshape(4, 2, 2)
+        forces = np.asarray(solution.plan).reshape(4, 2, 2)
         for end, standing in enumerate(MODE_ALPHA[mode] > 0):
             if not standing:
                 np.testing.assert_array_equal(forces[:, end], 0.0)
@@ -168,12 +176,12 @@ def test_tables_hold_the_model_over_one_model_step(bounded, model):
 
 def test_contact_points_make_no_difference_to_a_model_that_ignores_them(bounded, start):
     x, reference = start
-    arguments = (bounded, jnp.asarray(int(Mode.TROT)), lift(x), reference, jnp.zeros(16))
+    arguments = (bounded, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
     offline = solve(*arguments, config=BOUNDED)
     online = solve(*arguments, config=BOUNDED, feet=jnp.array([[0.1, -0.2], [-0.3, -0.4]]))
     assert offline.status == online.status == Status.SOLVED
     # The same iterations but for rounding: 2e-16 times condition 1e5 times forces of 1e2 N.
-    np.testing.assert_allclose(online.x, offline.x, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(online.plan, offline.plan, rtol=0, atol=1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -186,12 +194,12 @@ def test_measured_contact_points_at_their_nominal_place_give_the_tables_plan(
     mode, measured, body, start
 ):
     x, reference = start
-    arguments = (measured, jnp.asarray(int(mode)), lift(x), reference, jnp.zeros(16))
+    arguments = (measured, jnp.asarray(int(mode)), lift(x), reference, memory())
     offline = solve(*arguments, config=BOUNDED)
     online = solve(*arguments, config=BOUNDED, feet=body.feet)
     assert offline.status == online.status == Status.SOLVED
     # As above: rounding seen through the condition.
-    np.testing.assert_allclose(online.x, offline.x, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(online.plan, offline.plan, rtol=0, atol=1e-8)
 
 
 def test_a_foot_further_forward_takes_less_of_the_weight_to_hold_the_pitch(measured, body):
@@ -201,8 +209,8 @@ def test_a_foot_further_forward_takes_less_of_the_weight_to_hold_the_pitch(measu
     shares = []
     for shift in (-0.05, 0.0, 0.05):
         feet = body.feet.at[0, 0].add(shift)
-        arguments = (measured, jnp.asarray(int(Mode.TROT)), lift(x), reference, jnp.zeros(16))
-        force = solve(*arguments, config=BOUNDED, feet=feet).x[:4]
+        arguments = (measured, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
+        force = solve(*arguments, config=BOUNDED, feet=feet).plan[:4]
         shares.append(float(force[1] / (force[1] + force[3])))
     assert shares[0] > shares[1] > shares[2]
 
@@ -211,7 +219,7 @@ def test_plans_of_a_batch_with_mixed_modes_equal_single_plans(bounded, start):
     x, reference = start
     batch = jax.jit(
         jax.vmap(
-            lambda mode, z: lmpc.solve_lmpc(bounded, mode, z, reference, jnp.zeros(16), BOUNDED),
+            lambda mode, z: lmpc.solve_lmpc(bounded, mode, z, reference, memory(), BOUNDED),
             in_axes=(0, 0),
         )
     )
@@ -219,18 +227,18 @@ def test_plans_of_a_batch_with_mixed_modes_equal_single_plans(bounded, start):
     plans = batch(jnp.arange(5), jax.vmap(lift)(states))
     for mode in Mode:
         single = solve(
-            bounded, jnp.asarray(int(mode)), lift(states[mode]), reference, jnp.zeros(16), BOUNDED
+            bounded, jnp.asarray(int(mode)), lift(states[mode]), reference, memory(), BOUNDED
         )
         assert plans.status[mode] == single.status == Status.SOLVED
         # As above: rounding seen through the condition.
-        np.testing.assert_allclose(plans.x[mode], single.x, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(plans.plan[mode], single.plan, rtol=0, atol=1e-8)
 
 
 def test_changing_mode_and_state_traces_once(bounded, start):
     @jax.jit
     @chex.assert_max_traces(n=1)
     def plan(mode, x):
-        return lmpc.solve_lmpc(bounded, mode, lift(x), start[1], jnp.zeros(16), BOUNDED)
+        return lmpc.solve_lmpc(bounded, mode, lift(x), start[1], memory(), BOUNDED)
 
     results = [plan(jnp.asarray(int(mode)), start[0]) for mode in Mode]
     chex.assert_trees_all_equal_shapes_and_dtypes(*results)
@@ -242,17 +250,17 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
     reference = jnp.tile(jnp.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0]), (4, 1))
 
     def tick(carry, _):
-        x, warm = carry
-        plan = lmpc.solve_lmpc(
-            bounded, jnp.asarray(int(Mode.STAND)), lift(x), reference, warm, BOUNDED
-        )
+        x, memory = carry
+        mode = jnp.asarray(int(Mode.STAND), jnp.int32)
+        plan = lmpc.solve_lmpc(bounded, mode, lift(x), reference, memory, BOUNDED)
         for _ in range(5):
-            x = srb.rk4_step(body, alpha, x, plan.x[:4], DT)
-        return (x, lmpc.shift_plan(plan.x, BOUNDED)), (x, plan.status)
+            x = srb.rk4_step(body, alpha, x, plan.plan[:4], DT)
+        memory = lmpc.LmpcMemory(plan=plan.plan, mode=mode, warm=plan.warm)
+        return (x, memory), (x, plan.status)
 
     x0 = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
     _, (states, status) = jax.jit(lambda carry: jax.lax.scan(tick, carry, length=200))(
-        (x0, jnp.zeros(16))
+        (x0, lmpc.start_memory(bounded, BOUNDED, carry=True))
     )
     np.testing.assert_array_equal(status, Status.SOLVED)
     # 0.1 rad shrinks fivefold; the input weight on the absolute force leaves a droop in height.
@@ -353,3 +361,50 @@ def test_shifting_a_plan_drops_what_has_passed_and_repeats_its_end(control_dt, o
 def test_shifting_a_plan_of_one_step_keeps_it():
     plan = jnp.arange(4.0)
     np.testing.assert_array_equal(lmpc.shift_plan(plan, LmpcConfig(horizon=1)), plan)
+
+
+def test_a_tableau_carried_across_modes_changes_no_plan(bounded, start):
+    """Trot, front, front, trot, rear: the memory of another mode is another Hessian's."""
+    x, reference = start
+    carried = lmpc.start_memory(bounded, BOUNDED, carry=True)
+    plan = jax.jit(
+        lambda mode, x, carried: lmpc.solve_lmpc(
+            bounded, mode, lift(x), reference, carried, BOUNDED
+        )
+    )
+    for i, mode in enumerate((Mode.TROT, Mode.FRONT, Mode.FRONT, Mode.TROT, Mode.REAR)):
+        now = jnp.asarray(int(mode), jnp.int32)
+        seen = x.at[2].add(0.02 * i)
+        warm = plan(now, seen, carried)
+        cold = solve(bounded, now, lift(seen), reference, memory(), config=BOUNDED)
+        assert warm.status == Status.SOLVED
+        np.testing.assert_allclose(warm.plan, cold.plan, rtol=0, atol=1e-8)
+        carried = lmpc.LmpcMemory(plan=warm.plan, mode=now, warm=warm.warm)
+
+
+def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bounded, start):
+    x, reference = start
+    mode = jnp.asarray(int(Mode.TROT), jnp.int32)
+    posture = LegTrig(*(jnp.full((4,), f(a)) for a in (0.9, -0.9) for f in (np.sin, np.cos)))
+    stance = jnp.array([True, False, False, True])
+
+    def planned(friction, fraction):
+        rows = force_limits(
+            go1.PARAMS, posture, stance, friction=friction, torque_fraction=fraction
+        )
+        solution = solve(bounded, mode, lift(x), reference, memory(), config=BOUNDED, rows=rows)
+        assert solution.status == Status.SOLVED
+        return np.asarray(solution.plan).reshape(4, 4), rows
+
+    box = solve(bounded, mode, lift(x), reference, memory(), config=BOUNDED).plan.reshape(4, 4)
+    wide, _ = planned(1e3, 1e3)
+    np.testing.assert_allclose(wide, box, rtol=0, atol=1e-6)
+    ratio = np.abs(box[:, ::2]) / np.maximum(box[:, 1::2], 1e-9)
+    mu = 0.5 * float(ratio.max())
+    tight, _ = planned(mu, np.inf)
+    assert (np.abs(tight[:, ::2]) <= mu * tight[:, 1::2] + 1e-6).all()
+    torque = np.abs(np.einsum("rf,kf->kr", planned(np.inf, 1.0)[1].A, box))
+    fraction = 0.8 * float((torque / np.tile(go1.PARAMS.torque_limit[1:], 2)).max())
+    _, rows = planned(np.inf, fraction)
+    limited, _ = planned(np.inf, fraction)
+    assert (np.abs(limited @ rows.A.T) <= rows.high + 1e-6).all()

@@ -1,20 +1,17 @@
 """First-order solvers of the box QP: accelerated projected gradient, and ADMM.
 
-Both work on the scaled problem of ``qp.problem``, start from any point, stop at a relative KKT
-residual and run under ``jit`` and ``vmap`` (a batch runs as long as its slowest member; the ones
-that are done stand still).
+Both work on the scaled problem of ``qp.problem``, start from any point and stop at a relative KKT
+residual. They are there for comparison, and for what a tableau is too large for.
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from kjax.qp.problem import Prepared, Solution, Status, natural_residual
-
-Method = Literal["admm", "projected_gradient"]
+from kjax.qp.problem import Prepared, natural_residual
 
 
 class _Box(NamedTuple):
@@ -82,58 +79,23 @@ def _admm(prepared: Prepared, box: _Box) -> _Iteration:
     return _Iteration(init=init, step=step)
 
 
-_METHODS = {"admm": _admm, "projected_gradient": _projected_gradient}
+FIRST_ORDER = {"admm": _admm, "projected_gradient": _projected_gradient}
 
 
-def solve(
+def descend(
+    method: Callable[[Prepared, _Box], _Iteration],
     prepared: Prepared,
     q: Float[Array, "n"],
     lower: Float[Array, "n"],
     upper: Float[Array, "n"],
-    warm: Float[Array, "n"] | None = None,
+    x: Float[Array, "n"],
     *,
-    method: Method = "admm",
-    tolerance: float = 1e-6,
-    max_iterations: int = 2000,
-) -> Solution:
-    """Minimiser of 1/2 x^T H x + q^T x on lower <= x <= upper.
-
-    Args:
-      prepared: from ``prepare(H)``.
-      q: (n,) linear term.
-      lower: (n,) lower bounds; ``-inf`` for none, equal to ``upper`` to fix a variable.
-      upper: (n,) upper bounds; ``inf`` for none.
-      warm: (n,) starting point, the origin by default; it need not be feasible.
-      method: ``"admm"`` or ``"projected_gradient"``.
-      tolerance: relative KKT residual at which the problem counts as solved [-].
-      max_iterations: bound on the iterations.
-
-    Returns:
-      A ``Solution``; faulty data gives its status and a finite point, never a hang.
-    """
-    if method not in _METHODS:
-        raise ValueError(f"method must be one of {sorted(_METHODS)}, got {method!r}")
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations must be at least 1, got {max_iterations}")
-
-    feasible = ((lower <= upper) & (lower < jnp.inf) & (upper > -jnp.inf)).all()
-    nan_bound = jnp.isnan(lower).any() | jnp.isnan(upper).any()
-    finite = prepared.finite & jnp.isfinite(q).all() & ~nan_bound
-    fault = jnp.select(
-        [~finite, ~feasible, ~prepared.definite],
-        [Status.NON_FINITE, Status.INFEASIBLE_BOUNDS, Status.NOT_POSITIVE_DEFINITE],
-        Status.SOLVED,
-    ).astype(jnp.int32)
-    good = fault == Status.SOLVED
-
-    d = prepared.scale
-    box = _Box(
-        q=jnp.where(good, q * d, 0.0),
-        lower=jnp.where(good, lower / d, -jnp.inf),
-        upper=jnp.where(good, upper / d, jnp.inf),
-    )
-    start = jnp.zeros_like(q) if warm is None else jnp.where(jnp.isfinite(warm), warm, 0.0)
-    iteration = _METHODS[method](prepared, box)
+    tolerance: float,
+    max_iterations: int,
+) -> tuple[Float[Array, "n"], Float[Array, ""], Int[Array, ""]]:
+    """Best point, its residual and the iterations spent; all in scaled coordinates."""
+    box = _Box(q=q, lower=lower, upper=upper)
+    iteration = method(prepared, box)
 
     def residual(x: Array) -> Array:
         return natural_residual(prepared.H, box.q, box.lower, box.upper, x)
@@ -152,25 +114,12 @@ def solve(
 
     # Start from the better of the warm start and the clipped unconstrained minimiser. Where no
     # bound is active, the common case of a walking robot, the latter is the solution.
-    warm_start = box.clip(start / d)
-    free_minimiser = box.clip(-(prepared.inverse @ box.q))
+    warm_start, free_minimiser = box.clip(x), box.clip(-(prepared.inverse @ box.q))
     warm_error, free_error = residual(warm_start), residual(free_minimiser)
     x0 = jnp.where(free_error < warm_error, free_minimiser, warm_start)
-    error0 = jnp.where(good, jnp.minimum(free_error, warm_error), 0.0)
     _, best, error, count = jax.lax.while_loop(
-        unfinished, advance, (iteration.init(x0), x0, error0, jnp.zeros((), jnp.int32))
+        unfinished,
+        advance,
+        (iteration.init(x0), x0, jnp.minimum(free_error, warm_error), jnp.zeros((), jnp.int32)),
     )
-    status = jnp.where(good & ~(error <= tolerance), Status.ITERATION_LIMIT, fault)
-    # Where the data is faulty the point is the start, inside whatever bounds make sense.
-    low, high = (
-        jnp.where(jnp.isnan(bound) | (bound == absurd), 0.0, bound)
-        for bound, absurd in ((lower, jnp.inf), (upper, -jnp.inf))
-    )
-    fallback = jnp.clip(start, low, high)
-    x = jnp.where(good, jnp.clip(best * d, lower, upper), fallback)
-    return Solution(
-        x=x,
-        status=status.astype(jnp.int32),
-        residual=jnp.where(good, error, jnp.inf),
-        iterations=count,
-    )
+    return best, error, count

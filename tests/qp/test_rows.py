@@ -1,4 +1,6 @@
-"""The interior point on problems with a known answer, against the C solver daqp, on faulty data."""
+"""General rows on problems with a known answer, against the C solver daqp, on faulty data."""
+
+from functools import partial
 
 import daqp
 import jax
@@ -10,7 +12,13 @@ from kjax import qp
 from kjax.qp import Status
 
 N, M = 10, 14
-solve = jax.jit(qp.solve_rows, static_argnames=("tolerance", "max_iterations"))
+OPTIONS = ("method", "tolerance", "max_iterations")
+solve = jax.jit(qp.solve_rows, static_argnames=OPTIONS)
+
+
+@pytest.fixture(params=qp.ROW_METHODS)
+def method(request):
+    return request.param
 
 
 def known(seed, *, equations=0, fixed=0, rank=N):
@@ -44,23 +52,25 @@ def known(seed, *, equations=0, fixed=0, rank=N):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("equations", "fixed"), [(0, 0), (2, 0), (0, 2), (2, 1)])
-def test_it_finds_the_point_and_the_multipliers_of_a_known_kkt_point(seed, equations, fixed):
+def test_it_finds_the_point_and_the_multipliers_of_a_known_kkt_point(
+    seed, equations, fixed, method
+):
     problem, x, y = known(seed, equations=equations, fixed=fixed)
-    solution = solve(*problem)
+    solution = solve(*problem, method=method)
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, x, atol=1e-6)
     np.testing.assert_allclose(solution.multipliers, y, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_it_agrees_with_daqp_where_sides_are_infinite(seed):
+def test_it_agrees_with_daqp_where_sides_are_infinite(seed, method):
     rng = np.random.default_rng(100 + seed)
     (H, _, C, *_), _, _ = known(seed)
     q = 10.0 * rng.normal(size=N)
     low, high = -rng.uniform(0.1, 1.0, M + N), rng.uniform(0.1, 1.0, M + N)
     low[rng.random(M + N) < 0.3] = -np.inf
     high[rng.random(M + N) < 0.3] = np.inf
-    solution = solve(H, q, C, low[:M], high[:M], low[M:], high[M:])
+    solution = solve(H, q, C, low[:M], high[:M], low[M:], high[M:], method=method)
     order = np.r_[M : M + N, 0:M]  # daqp wants the box first
     bounds = [np.clip(b[order], -1e30, 1e30) for b in (high, low)]
     wanted, _, flag, _ = daqp.solve(H, q, C, *bounds, np.zeros(M + N, np.int32))
@@ -69,10 +79,10 @@ def test_it_agrees_with_daqp_where_sides_are_infinite(seed):
     np.testing.assert_allclose(solution.x, wanted, atol=1e-5)
 
 
-def test_without_rows_it_solves_the_box_qp(random_qp):
+def test_without_rows_it_solves_the_box_qp(random_qp, method):
     H, q, lower, upper, x = random_qp(3)
     empty = jnp.zeros((0, len(q)))
-    solution = solve(H, q, empty, jnp.zeros(0), jnp.zeros(0), lower, upper)
+    solution = solve(H, q, empty, jnp.zeros(0), jnp.zeros(0), lower, upper, method=method)
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, x, atol=1e-6)
 
@@ -94,35 +104,38 @@ def test_a_singular_hessian_is_solved_where_rows_and_box_hold_the_minimiser():
 
 
 @pytest.mark.parametrize("factor", [1e-8, 1e8])
-def test_a_common_factor_of_the_cost_changes_nothing(factor):
+def test_a_common_factor_of_the_cost_changes_nothing(factor, method):
     (H, q, *rest), x, y = known(0)
-    solution = solve(factor * H, factor * q, *rest)
+    solution = solve(factor * H, factor * q, *rest, method=method)
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, x, atol=1e-6)
     np.testing.assert_allclose(solution.multipliers / factor, y, atol=1e-5)
 
 
-def test_a_batch_gives_what_single_calls_give():
+def test_a_batch_gives_what_single_calls_give(method):
     problems = [known(seed)[0] for seed in range(5)]
-    batch = jax.vmap(solve)(*(jnp.stack(parts) for parts in zip(*problems, strict=True)))
+    batch = jax.vmap(partial(solve, method=method))(
+        *(jnp.stack(parts) for parts in zip(*problems, strict=True))
+    )
     for i, problem in enumerate(problems):
-        np.testing.assert_allclose(batch.x[i], solve(*problem).x, atol=1e-7)
+        np.testing.assert_allclose(batch.x[i], solve(*problem, method=method).x, atol=1e-7)
 
 
-def test_in_float32_it_is_as_good_as_float32_lets_it_be():
+def test_in_float32_it_is_as_good_as_float32_lets_it_be(method):
     problem, x, _ = known(2)
-    solution = solve(*(jnp.asarray(a, jnp.float32) for a in problem), tolerance=1e-4)
+    solution = solve(*(jnp.asarray(a, jnp.float32) for a in problem), tolerance=1e-4, method=method)
     assert solution.x.dtype == jnp.float32
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, x, atol=2e-2)
 
 
-def test_an_infeasible_problem_is_not_called_solved():
+def test_an_infeasible_problem_is_not_called_solved(method):
     (H, q, C, low, high, lower, upper), _, _ = known(1)
     C, low, high = C.copy(), low.copy(), high.copy()
     C[1], low[0], high[0], low[1], high[1] = C[0], 1.0, 2.0, -2.0, -1.0
-    solution = solve(H, q, C, low, high, lower, upper)
-    assert solution.status == Status.ITERATION_LIMIT
+    solution = solve(H, q, C, low, high, lower, upper, method=method)
+    proven = method == "active_set"
+    assert solution.status == (Status.INFEASIBLE if proven else Status.ITERATION_LIMIT)
     assert solution.primal > 1e-3
     assert jnp.isfinite(solution.x).all()
 
@@ -140,18 +153,18 @@ def test_an_infeasible_problem_is_not_called_solved():
         ("H", -50.0, Status.NOT_POSITIVE_DEFINITE),
     ],
 )
-def test_faulty_data_has_its_status_and_a_finite_point(place, value, status):
+def test_faulty_data_has_its_status_and_a_finite_point(place, value, status, method):
     names = ("H", "q", "C", "row_lower", "row_upper", "lower", "upper")
     data = {name: a.copy() for name, a in zip(names, known(0)[0], strict=True)}
     index = (0,) * data[place].ndim
     data[place][index] = value
-    solution = solve(*data.values())
+    solution = solve(*data.values(), method=method)
     assert solution.status == status
     assert jnp.isfinite(solution.x).all()
 
 
-def test_an_iteration_limit_is_reported():
-    solution = solve(*known(0)[0], max_iterations=2)
+def test_an_iteration_limit_is_reported(method):
+    solution = solve(*known(0)[0], max_iterations=2, method=method)
     assert solution.status == Status.ITERATION_LIMIT
     assert solution.iterations == 2
 
@@ -159,3 +172,67 @@ def test_an_iteration_limit_is_reported():
 def test_a_senseless_iteration_limit_is_refused():
     with pytest.raises(ValueError, match="max_iterations"):
         solve(*known(0)[0], max_iterations=0)
+
+
+def test_a_senseless_tolerance_is_refused():
+    with pytest.raises(ValueError, match="tolerance"):
+        solve(*known(0)[0], tolerance=0.0)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_the_active_set_method_is_exact_where_rows_depend_on_one_another(seed):
+    """Twice the same row, at another scale: at the solution the normals are dependent."""
+    (H, q, C, low, high, lower, upper), _, _ = known(seed, equations=seed % 3, fixed=seed % 2)
+    C, low, high = C.copy(), low.copy(), high.copy()
+    C[5], low[5], high[5] = 3.0 * C[0], 3.0 * low[0], 3.0 * high[0]
+    solution = solve(H, 5.0 * q, C, low, high, lower, upper, method="active_set")
+    order = np.r_[M : M + N, 0:M]
+    sides = [np.r_[a, b][order] for a, b in ((high, upper), (low, lower))]
+    sense = np.where(sides[0] == sides[1], 5, 0).astype(np.int32)
+    wanted, _, flag, _ = daqp.solve(H, 5.0 * q, C, *sides, sense)
+    assert (solution.status == Status.SOLVED) == (flag >= 1)
+    if flag >= 1:
+        np.testing.assert_allclose(solution.x, wanted, atol=1e-8)
+    else:
+        assert solution.status == Status.INFEASIBLE
+
+
+@pytest.fixture(scope="module")
+def row_gradients():
+    """Gradient of a number that all of x enters, by all seven arguments; compiled per method."""
+    weight = jnp.linspace(1.0, 2.0, N)
+
+    def value(method, *problem):
+        solution = qp.solve_rows(*problem, method=method)
+        return weight @ solution.x
+
+    return jax.jit(value, static_argnums=0), {
+        method: jax.jit(jax.grad(partial(value, method), argnums=range(7)))
+        for method in qp.ROW_METHODS
+    }
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_derivatives_of_rows_agree_with_finite_differences(row_gradients, method, seed):
+    problem = known(seed, equations=1, fixed=1)[0]
+    value, gradients = row_gradients
+    assert solve(*problem, method="active_set").margin > 1e-3
+    slopes = gradients[method](*problem)
+    rng = np.random.default_rng(seed)
+    directions = [rng.normal(size=a.shape) for a in problem]
+    # Equal bounds move together, or nothing feasible is left.
+    directions[4] = np.where(problem[3] == problem[4], directions[3], directions[4])
+    directions[6] = np.where(problem[5] == problem[6], directions[5], directions[6])
+    step = 1e-6
+    ahead, behind = (
+        value(
+            "active_set", *(a + sign * step * d for a, d in zip(problem, directions, strict=True))
+        )
+        for sign in (1.0, -1.0)
+    )
+    wanted = (ahead - behind) / (2.0 * step)
+    got = sum(jnp.vdot(s, d) for s, d in zip(slopes, directions, strict=True))
+    # Central differences of an exact solver: step^2 of curvature and 1e-13 / step of rounding; the
+    # interior point finds its multipliers to its tolerance, times the condition of 100.
+    tolerance = 1e-6 if method == "active_set" else 1e-5
+    np.testing.assert_allclose(got, wanted, rtol=tolerance, atol=tolerance)

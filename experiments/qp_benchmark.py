@@ -1,0 +1,579 @@
+"""The QP solvers beside their peers, on the QPs of closed loops; run by benchmark.py qp."""
+
+import importlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+from kjax import cli, planning, qp
+from kjax.config import RunConfig, load_config
+from kjax.controller import build_controller
+from kjax.mpc import lmpc, multiphase
+from kjax.sim.episode import initial_state
+from kjax.sim.mujoco_loop import build_simulation
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
+HORIZONS = {40: 10, 80: 20, 200: 50}  # variables: steps of 20 ms of the long trot
+ROUNDS = 3  # of every timing; the medians over all calls are reported
+PEERS = ("daqp", "quadprog", "osqp", "proxsuite", "piqp", "clarabel", "qpSWIFT", "qpax")
+
+Box = tuple[np.ndarray, ...]  # H, q, lower, upper
+Solver = Callable[..., np.ndarray]
+
+
+def run(folder: Path, *, quick: bool) -> dict[str, Any]:
+    """All measurements; leaves figure.png and table.md in the folder."""
+    seconds = 1.0 if quick else 6.0
+    present = {name: _import(name) for name in PEERS}
+    missing = [name for name, module in present.items() if module is None]
+    if missing:
+        print(f"not installed, left out: {', '.join(missing)} (pip install -e '.[peers]')")
+    peers = {name: module for name, module in present.items() if module is not None}
+    result: dict[str, Any] = {"missing": missing, "box": {}, "batch": {}, "size": {}, "rows": {}}
+    for name in ("trot_velocity", "bound_velocity"):
+        log = record_box(name, seconds)
+        result["box"][name] = box_single(log, peers)
+        result["box"][name] |= box_in_scan(log)
+        sizes = BATCHES[:4] if quick else BATCHES
+        result["batch"][name] = box_batch(log, peers, sizes)
+    for variables, steps in HORIZONS.items():
+        log = record_box("trot_velocity_long", 0.5, {"lmpc.horizon": steps})
+        result["size"][variables] = box_single(log, peers, count=50)
+    result["size"][24] = result["box"]["trot_velocity"]
+    result["rows"] = rows_single(record_rows(seconds), peers)
+    (folder / "table.md").write_text(table(result), encoding="utf-8")
+    figure(result, folder / "figure.png")
+    return result
+
+
+def _import(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+# ---------------------------------------------------------------- problems from closed loops
+
+
+def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
+    """What ``planner`` returns as memory along a walk of the config's own controller."""
+    simulation = build_simulation(config)
+    controller, params, model = simulation.controller, simulation.params, simulation.model
+    recorder = build_controller(config, planner)
+    plan, act = jax.jit(controller.plan), jax.jit(controller.act)
+    look = jax.jit(lambda state, seen: recorder.plan(params, state, seen)[0].memory)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+    mujoco.mj_forward(model, data)
+    state, kept = None, []
+    steps = round(seconds / config.sim.sim_dt)
+    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    for i in tqdm(range(steps), desc="walking", leave=False, disable=None):
+        seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
+        if state is None:
+            state = controller.init(params, seen)
+        if i % per_tick == 0:
+            kept.append(jax.tree.map(np.array, look(state, seen)))
+            state, _ = plan(params, state, seen)
+        state, torque = act(params, state, seen)
+        data.ctrl[simulation.addresses.actuator.reshape(-1)] = np.asarray(torque).reshape(-1)
+        mujoco.mj_step(model, data)
+    return kept
+
+
+def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
+    config = load_config(RunConfig, CONFIGS / f"{name}.toml", changes or {})
+    own = planning.build_planner(config)
+
+    def planner(params: Any, task: Any) -> Any:
+        seen: dict[str, Any] = {}
+
+        def solve(prepared: Any, q: Any, lower: Any, upper: Any, *args: Any, **options: Any) -> Any:
+            seen.update(q=q, lower=lower, upper=upper)
+            return real(prepared, q, lower, upper, *args, **options)
+
+        real = qp.solve
+        with mock.patch.object(lmpc.qp, "solve", solve):
+            plan = own(params, task)
+        return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
+
+    mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
+    hessian = build_simulation(config).params.tables.hessian
+    H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
+    used = (upper > lower).any(axis=1)  # nothing is planned in flight
+    return {
+        "prepared": jax.device_put(hessian),
+        "mode": mode[used],
+        "H": H,
+        "q": q[used],
+        "lower": lower[used],
+        "upper": upper[used],
+    }
+
+
+def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
+    """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
+    config = load_config(RunConfig, CONFIGS / "bound_multiphase.toml", {})
+    own = planning.build_planner(config)
+
+    def planner(params: Any, task: Any) -> Any:
+        seen: list[Any] = []
+
+        def solve(*args: Any, **options: Any) -> Any:
+            seen.append(args)
+            return real(*args, **options)
+
+        real = qp.solve_rows
+        # The planner holds both horizons behind a cond, whose tracers may not leave it.
+        with (
+            mock.patch.object(multiphase.qp, "solve_rows", solve),
+            mock.patch.object(planning.jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
+        ):
+            plan = own(params, task)
+        return plan._replace(memory=seen[0])
+
+    kept = _drive(config, planner, seconds)
+    return [problem for problem in kept if (problem[6] > problem[5]).any()]
+
+
+# ---------------------------------------------------------------- solvers
+
+
+def box_peers(peers: dict[str, Any]) -> dict[str, Callable[[np.ndarray], Solver]]:
+    """Per peer: from H to a call (q, lower, upper) -> x; what it may keep of H, it keeps."""
+    made: dict[str, Callable[[np.ndarray], Solver]] = {}
+    if "daqp" in peers:
+        made["daqp, cold"] = _daqp_cold
+        made["daqp, warm"] = _daqp_warm
+    if "quadprog" in peers:
+        made["quadprog"] = _quadprog
+    if "osqp" in peers:
+        made["OSQP 1e-6"] = _osqp
+    if "proxsuite" in peers:
+        made["ProxQP, warm"] = _proxqp
+    if "piqp" in peers:
+        made["PIQP"] = _piqp
+    if "clarabel" in peers:
+        made["Clarabel"] = _clarabel
+    if "qpSWIFT" in peers:
+        made["qpSWIFT"] = _qpswift
+    if "qpax" in peers:
+        made["qpax"] = _qpax
+    return made
+
+
+def _daqp_cold(H: np.ndarray) -> Solver:
+    import daqp
+
+    n = len(H)
+    none, sense = np.zeros((0, n)), np.zeros(n, np.int32)
+    return lambda q, lower, upper: daqp.solve(H, q, none, upper, lower, sense)[0]
+
+
+def _daqp_warm(H: np.ndarray) -> Solver:
+    import daqp
+
+    n, model = len(H), None
+
+    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        nonlocal model
+        if model is None:
+            model = daqp.Model()
+            model.setup(H, q, np.zeros((0, n)), upper, lower, np.zeros(n, np.int32))
+        else:
+            model.update(f=q)
+        return model.solve()[0]
+
+    return call
+
+
+def _quadprog(H: np.ndarray) -> Solver:
+    import quadprog
+
+    n = len(H)
+    sides = np.hstack([np.eye(n), -np.eye(n)])
+
+    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        return quadprog.solve_qp(H, -q, sides, np.r_[lower, -upper])[0]
+
+    return call
+
+
+def _osqp(H: np.ndarray) -> Solver:
+    import osqp
+    from scipy import sparse
+
+    n, model = len(H), None
+
+    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        nonlocal model
+        if model is None:
+            model = osqp.OSQP()
+            model.setup(
+                sparse.csc_matrix(np.triu(H)), q, sparse.eye(n, format="csc"), lower, upper,
+                verbose=False, eps_abs=1e-6, eps_rel=1e-6,
+            )  # fmt: skip
+        else:
+            model.update(q=q, l=lower, u=upper)
+        return model.solve().x
+
+    return call
+
+
+def _proxqp(H: np.ndarray) -> Solver:
+    import proxsuite
+
+    dense = proxsuite.proxqp.dense
+    n, model = len(H), None
+
+    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        nonlocal model
+        if model is None:
+            model = dense.QP(n, 0, 0, True)
+            model.init(H, q, None, None, None, None, None, lower, upper)
+            model.settings.initial_guess = (
+                proxsuite.proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
+            )
+        else:
+            model.update(None, q, None, None, None, None, None, lower, upper)
+        model.solve()
+        return model.results.x
+
+    return call
+
+
+def _piqp(H: np.ndarray) -> Solver:
+    import piqp
+
+    model = None
+
+    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        nonlocal model
+        if model is None:
+            model = piqp.DenseSolver()
+            model.setup(H, q, x_l=lower, x_u=upper)
+        else:
+            model.update(c=q, x_l=lower, x_u=upper)
+        model.solve()
+        return model.result.x
+
+    return call
+
+
+def _clarabel(H: np.ndarray) -> Solver:
+    import clarabel
+    from scipy import sparse
+
+    n = len(H)
+    P = sparse.csc_matrix(np.triu(H))
+    A = sparse.vstack([sparse.eye(n), -sparse.eye(n)], format="csc")
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+
+    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        cones = [clarabel.NonnegativeConeT(2 * n)]
+        model = clarabel.DefaultSolver(P, q, A, np.r_[upper, -lower], cones, settings)
+        return np.asarray(model.solve().x)
+
+    return call
+
+
+def _qpswift(H: np.ndarray) -> Solver:
+    import qpSWIFT
+
+    G = np.vstack([np.eye(len(H)), -np.eye(len(H))])
+    return lambda q, lower, upper: qpSWIFT.run(q, np.r_[upper, -lower], H, G)["sol"]
+
+
+def _qpax(H: np.ndarray) -> Solver:
+    import qpax
+
+    n = len(H)
+    solve = jax.jit(
+        lambda q, lower, upper: qpax.solve_qp(
+            jnp.asarray(H), q, jnp.zeros((0, n)), jnp.zeros(0),
+            jnp.concatenate([jnp.eye(n), -jnp.eye(n)]), jnp.concatenate([upper, -lower]),
+        )[0]
+    )  # fmt: skip
+    return lambda q, lower, upper: np.asarray(solve(q, lower, upper))
+
+
+# ---------------------------------------------------------------- measurements
+
+
+def _timed(call: Callable[[int], Any], indices: Any) -> float:
+    """Median time of a call [us]."""
+    times = []
+    for i in indices:
+        clock = time.perf_counter()
+        call(i)
+        times.append(time.perf_counter() - clock)
+    return 1e6 * float(np.median(times))
+
+
+def box_single(log: dict[str, Any], peers: dict[str, Any], count: int = 400) -> dict[str, Any]:
+    """Latency of calls from Python along the log, tick by tick, and how good their points are."""
+    q, lower, upper, mode = (log[k][:count] for k in ("q", "lower", "upper", "mode"))
+    ticks, prepared = range(len(q)), log["prepared"]
+
+    # Bounds change with the mode only: they stay in the compiled program, as H does.
+    bounds = {int(m): (lower[mode == m][0], upper[mode == m][0]) for m in np.unique(mode)}
+    calls = {
+        m: jax.jit(_one_mode(jax.tree.map(lambda a, m=m: a[m], prepared), *sides))
+        for m, sides in bounds.items()
+    }
+    cold = {
+        m: qp.start(jax.tree.map(lambda a, m=m: a[m], prepared)) for m in bounds
+    }  # one tableau per mode, carried on when the mode comes back
+    state: dict[str, Any] = {"warm": dict(cold)}
+
+    def ours(i: int) -> np.ndarray:
+        m = int(mode[i])
+        x, warm = calls[m](q[i], state["warm"][m])
+        state["warm"][m] = warm
+        return np.asarray(x)
+
+    solvers: dict[str, Callable[[int], np.ndarray]] = {"kjax tableau, warm": ours}
+    for name, make in box_peers(peers).items():
+        by_mode = {int(m): make(log["H"][m]) for m in np.unique(mode)}
+        solvers[name] = lambda i, by_mode=by_mode: by_mode[int(mode[i])](q[i], lower[i], upper[i])
+    noop = jax.jit(lambda q, warm: (q + 1.0, warm))
+    solvers["empty jitted call"] = lambda i: np.asarray(noop(q[i], state["warm"][int(mode[i])])[0])
+    wanted = _reference(log, ticks)
+    result: dict[str, Any] = {}
+    times: dict[str, list[float]] = {name: [] for name in solvers}
+    points = {}
+    for round_ in range(ROUNDS):
+        for name, solve in solvers.items():
+            if round_ == 0:
+                points[name] = [solve(i) for i in ticks]  # also warms up
+            times[name].append(_timed(solve, ticks))
+    residual = jax.jit(qp.kkt_residual)
+    for name, values in times.items():
+        entry = {"us_median": float(np.median(values))}
+        if name != "empty jitted call":
+            errors = [np.abs(p - w).max() for p, w in zip(points[name], wanted, strict=True)]
+            entry["force_error_max_N"] = float(np.max(errors))
+            entry["kkt_residual_max"] = max(
+                float(residual(log["H"][mode[i]], q[i], lower[i], upper[i], points[name][i]))
+                for i in ticks
+            )
+        result[name] = entry
+    return result
+
+
+def _one_mode(prepared: Any, lower: np.ndarray, upper: np.ndarray) -> Callable[..., Any]:
+    def call(q: Any, warm: Any) -> Any:
+        solution = qp.solve(prepared, q, lower, upper, warm)
+        return solution.x, solution.warm
+
+    return call
+
+
+def _reference(log: dict[str, Any], ticks: range) -> list[np.ndarray]:
+    """The minimisers to rounding: daqp with its tolerances at 1e-12."""
+    import daqp
+
+    n = log["q"].shape[1]
+    none, sense = np.zeros((0, n)), np.zeros(n, np.int32)
+    return [
+        daqp.solve(
+            log["H"][log["mode"][i]], log["q"][i], none, log["upper"][i], log["lower"][i], sense,
+            primal_tol=1e-12, dual_tol=1e-12,
+        )[0]
+        for i in ticks
+    ]  # fmt: skip
+
+
+def box_in_scan(log: dict[str, Any]) -> dict[str, Any]:
+    """Time per tick inside one compiled scan: value, and value with its gradient [us]."""
+    data = tuple(jnp.asarray(log[k]) for k in ("mode", "q", "lower", "upper"))
+    prepared, count = log["prepared"], len(log["q"])
+
+    def tick(carry: Any, row: Any, weight: Any) -> Any:
+        warm, last = carry
+        mode, q, lower, upper = row
+        cold = qp.start(jax.tree.map(lambda a: a[mode], prepared))
+        warm = jax.tree.map(lambda old, new: jnp.where(mode == last, old, new), warm, cold)
+
+        def value(q: Any) -> Any:
+            solution = qp.solve(prepared, q, lower, upper, warm, index=mode)
+            return solution.x.sum(), (solution.x, solution.warm)
+
+        if weight:
+            (_, (x, warm)), slope = jax.value_and_grad(value, has_aux=True)(q)
+            return (warm, mode), (x, slope)
+        _, (x, warm) = value(q)
+        return (warm, mode), x
+
+    start = qp.start(jax.tree.map(lambda a: a[0], prepared)), jnp.asarray(-1, data[0].dtype)
+    result = {}
+    for name, weight in (("value", False), ("value and gradient", True)):
+        scan = jax.jit(
+            lambda rows, weight=weight: jax.lax.scan(
+                lambda carry, row: tick(carry, row, weight), start, rows
+            )[1]
+        )
+        jax.block_until_ready(scan(data))
+        spent = _timed(lambda _, scan=scan: jax.block_until_ready(scan(data)), range(15))
+        result[f"kjax in a scan, {name}"] = {"us_median": spent / count}
+    return result
+
+
+def box_batch(log: dict[str, Any], peers: dict[str, Any], sizes: Any) -> dict[str, Any]:
+    """Time per problem of a batch of ticks drawn at random, cold [us]."""
+    rng = np.random.default_rng(0)
+    prepared = log["prepared"]
+
+    def one(mode: Any, q: Any, lower: Any, upper: Any) -> Any:
+        return qp.solve(prepared, q, lower, upper, index=mode).x
+
+    batch = jax.jit(jax.vmap(one))
+    solvers = {int(m): _daqp_cold(log["H"][m]) for m in np.unique(log["mode"])}
+    result: dict[str, Any] = {}
+    for size in sizes:
+        pick = rng.choice(len(log["q"]), size)
+        host = [log[k][pick] for k in ("mode", "q", "lower", "upper")]
+        data = [jnp.asarray(a) for a in host]
+        jax.block_until_ready(batch(*data))
+        ours = _timed(lambda _, data=data: jax.block_until_ready(batch(*data)), range(15))
+        entry = {"kjax": ours / size}
+        if "daqp" in peers:
+
+            def loop(_: int, host: Any = host) -> None:
+                for mode, q, lower, upper in zip(*host, strict=True):
+                    solvers[int(mode)](q, lower, upper)
+
+            entry["daqp loop"] = _timed(loop, range(5)) / size
+        result[str(size)] = entry
+    return result
+
+
+def rows_single(problems: list[Any], peers: dict[str, Any], count: int = 300) -> dict[str, Any]:
+    """Latency on the bound's QPs with friction and torque rows, H new in every tick [us]."""
+    problems = problems[:count]
+    solvers: dict[str, Callable[[int], Any]] = {}
+    for method in qp.ROW_METHODS:
+        call = jax.jit(lambda *p, method=method: qp.solve_rows(*p, method=method).x)
+        solvers[f"kjax {method}"] = lambda i, call=call: np.asarray(call(*problems[i]))
+    n, m = problems[0][2].shape[1], problems[0][2].shape[0]
+    clip = [[np.clip(a, -1e30, 1e30) for a in p] for p in problems]
+    if "daqp" in peers:
+        import daqp
+
+        sense = np.zeros(n + m, np.int32)
+        high = [np.r_[p[6], p[4]] for p in clip]
+        low = [np.r_[p[5], p[3]] for p in clip]
+        solvers["daqp, cold"] = lambda i: daqp.solve(
+            clip[i][0], clip[i][1], clip[i][2], high[i], low[i], sense
+        )[0]
+    if "piqp" in peers:
+        import piqp
+
+        model = piqp.DenseSolver()
+        model.setup(*clip[0][:2], None, None, *clip[0][2:])
+
+        def by_piqp(i: int) -> Any:
+            model.update(*clip[i][:2], None, None, *clip[i][2:])
+            model.solve()
+            return model.result.x
+
+        solvers["PIQP"] = by_piqp
+    if "proxsuite" in peers:
+        import proxsuite
+
+        prox = proxsuite.proxqp.dense.QP(n, 0, m, True)
+        prox.init(*clip[0][:2], None, None, *clip[0][2:])
+        prox.settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
+
+        def by_proxqp(i: int) -> Any:
+            prox.update(*clip[i][:2], None, None, *clip[i][2:])
+            prox.solve()
+            return prox.results.x
+
+        solvers["ProxQP, warm"] = by_proxqp
+    ticks = range(len(problems))
+    points = {name: [np.array(solve(i)) for i in ticks] for name, solve in solvers.items()}
+    exact = points["kjax active_set"]
+    result = {}
+    for name, solve in solvers.items():
+        spent = float(np.median([_timed(solve, ticks) for _ in range(ROUNDS)]))
+        error = max(np.abs(a - b).max() for a, b in zip(points[name], exact, strict=True))
+        result[name] = {"us_median": spent, "apart_from_active_set_max_N": float(error)}
+    return result
+
+
+# ---------------------------------------------------------------- presentation
+
+
+def table(result: dict[str, Any]) -> str:
+    """All of it as Markdown."""
+    lines = ["| single call from Python, 24 variables | trot [us] | bound [us] | "
+             "largest force error [N] |", "|---|---|---|---|"]  # fmt: skip
+    trot, bound = result["box"]["trot_velocity"], result["box"]["bound_velocity"]
+    for name, entry in trot.items():
+        error = max(e.get("force_error_max_N", 0.0) for e in (entry, bound[name]))
+        lines.append(
+            f"| {name} | {entry['us_median']:.1f} | {bound[name]['us_median']:.1f} | {error:.1e} |"
+        )
+    lines += ["", "| batch | " + " | ".join(result["batch"]["trot_velocity"]) + " |"]
+    lines.append("|---" * (1 + len(result["batch"]["trot_velocity"])) + "|")
+    for gait, batches in result["batch"].items():
+        for solver in next(iter(batches.values())):
+            cells = " | ".join(f"{entry[solver]:.1f}" for entry in batches.values())
+            lines.append(f"| {gait}, {solver}, us per problem | {cells} |")
+    lines += ["", "| rows: bound with a horizon through flight, 30 variables | us | "
+              "apart from active_set [N] |", "|---|---|---|"]  # fmt: skip
+    for name, entry in result["rows"].items():
+        apart = entry["apart_from_active_set_max_N"]
+        lines.append(f"| {name} | {entry['us_median']:.0f} | {apart:.1e} |")
+    return "\n".join(lines) + "\n"
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Cost against the number of variables, and against the batch."""
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    sizes = sorted(int(k) for k in result["size"])
+    names = [n for n in result["size"][sizes[0]] if "scan" not in n and "empty" not in n]
+    by_size = {int(k): v for k, v in result["size"].items()}
+    for name in names:
+        ours = name.startswith("kjax")
+        left.loglog(
+            sizes,
+            [by_size[n][name]["us_median"] for n in sizes],
+            "o-" if ours else ".-",
+            lw=2.5 if ours else 1.0,
+            label=name,
+        )
+    left.set(xlabel="variables", ylabel="single call from Python [us]", title="QPs of the trot")
+    left.set_xticks(sizes, [str(n) for n in sizes])
+    left.minorticks_off()
+    left.legend(fontsize=7)
+    for color, (gait, batches) in zip(("C0", "C1"), result["batch"].items(), strict=True):
+        counts = [int(k) for k in batches]
+        for solver, style in (("kjax", "o-"), ("daqp loop", "--")):
+            if solver in next(iter(batches.values())):
+                values = [entry[solver] for entry in batches.values()]
+                label = f"{gait.split('_')[0]}, {solver}"
+                right.loglog(counts, values, style, color=color, label=label)
+    right.set(xlabel="batch", ylabel="us per problem", title="24 variables, cold, one thread")
+    right.legend(fontsize=8)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
+
+
+def save(folder: Path, result: dict[str, Any]) -> None:
+    """JSON beside the figure."""
+    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
