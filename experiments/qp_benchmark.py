@@ -161,8 +161,7 @@ def box_peers(peers: dict[str, Any]) -> dict[str, Callable[[np.ndarray], Solver]
         made["quadprog"] = _quadprog
     if "osqp" in peers:
         made["OSQP 1e-6"] = _osqp
-    if "proxsuite" in peers:
-        made["ProxQP, warm"] = _proxqp
+    # ProxQP takes part with rows only: 0.8 ends the process on these boxes with equal bounds.
     if "piqp" in peers:
         made["PIQP"] = _piqp
     if "clarabel" in peers:
@@ -206,7 +205,9 @@ def _quadprog(H: np.ndarray) -> Solver:
     sides = np.hstack([np.eye(n), -np.eye(n)])
 
     def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        return quadprog.solve_qp(H, -q, sides, np.r_[lower, -upper])[0]
+        # Equal bounds as two inequalities it calls inconsistent; 1e-9 N between them it solves.
+        apart = np.where(lower == upper, 1e-9, 0.0)
+        return quadprog.solve_qp(H, -q, sides, np.r_[lower - apart, -upper])[0]
 
     return call
 
@@ -232,40 +233,14 @@ def _osqp(H: np.ndarray) -> Solver:
     return call
 
 
-def _proxqp(H: np.ndarray) -> Solver:
-    import proxsuite
-
-    dense = proxsuite.proxqp.dense
-    n, model = len(H), None
-
-    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        nonlocal model
-        if model is None:
-            model = dense.QP(n, 0, 0, True)
-            model.init(H, q, None, None, None, None, None, lower, upper)
-            model.settings.initial_guess = (
-                proxsuite.proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
-            )
-        else:
-            model.update(None, q, None, None, None, None, None, lower, upper)
-        model.solve()
-        return model.results.x
-
-    return call
-
-
 def _piqp(H: np.ndarray) -> Solver:
     import piqp
 
-    model = None
+    rows = np.eye(len(H))
 
     def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        nonlocal model
-        if model is None:
-            model = piqp.DenseSolver()
-            model.setup(H, q, x_l=lower, x_u=upper)
-        else:
-            model.update(c=q, x_l=lower, x_u=upper)
+        model = piqp.DenseSolver()
+        model.setup(H, q, None, None, rows, lower, upper)  # equal x_l, x_u it calls infeasible
         model.solve()
         return model.result.x
 
@@ -482,11 +457,24 @@ def rows_single(problems: list[Any], peers: dict[str, Any], count: int = 300) ->
     if "piqp" in peers:
         import piqp
 
+        # The box among the rows: equal x_l and x_u it calls infeasible.
+        stacked = [
+            (
+                p[0],
+                p[1],
+                None,
+                None,
+                np.vstack([p[2], np.eye(n)]),
+                np.r_[p[3], p[5]],
+                np.r_[p[4], p[6]],
+            )
+            for p in clip
+        ]
         model = piqp.DenseSolver()
-        model.setup(*clip[0][:2], None, None, *clip[0][2:])
+        model.setup(*stacked[0])
 
         def by_piqp(i: int) -> Any:
-            model.update(*clip[i][:2], None, None, *clip[i][2:])
+            model.update(*stacked[i])
             model.solve()
             return model.result.x
 
