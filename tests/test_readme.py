@@ -19,7 +19,7 @@ def blocks(repository, language):
 
 def test_the_controller_example_walks_somebody_elses_robot(repository):
     """The reader's loop: raw MuJoCo here, none of kjax's simulation code but the scene."""
-    (code,) = blocks(repository, "python")
+    code, _ = blocks(repository, "python")
     model = build_model(RunConfig().sim)
     at = resolve(model)
     data = mujoco.MjData(model)
@@ -52,6 +52,18 @@ def test_the_controller_example_walks_somebody_elses_robot(repository):
     assert len(heights) == 1000
     assert 0.25 < min(heights) < max(heights) < 0.31
     assert int(scope["info"].status) == 0
+
+
+def test_the_qp_example_runs_in_the_precision_that_a_reader_has(repository):
+    _, code = blocks(repository, "python")
+    scope = {}
+    with jax.enable_x64(False):
+        exec(code, scope)
+    # By hand: the second variable is at its bound 1, the first solves 4 x + 1 + 1.01 = 0.
+    np.testing.assert_allclose(scope["x"], [-0.5025, 1.0], rtol=1e-5)
+    np.testing.assert_allclose(scope["slope"], [-0.25, 0.0], rtol=1e-5)
+    # Without the factor 1.01 the first is -0.5, and the row x_1 + x_2 <= 0.5 holds just so.
+    np.testing.assert_allclose(scope["rows"].x, [-0.5, 1.0], rtol=1e-5)
 
 
 def test_the_commands_name_files_and_keys_that_exist(repository):
