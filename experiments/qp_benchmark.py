@@ -41,15 +41,18 @@ def run(folder: Path, *, quick: bool) -> dict[str, Any]:
     peers = {name: module for name, module in present.items() if module is not None}
     result: dict[str, Any] = {"missing": missing, "box": {}, "batch": {}, "size": {}, "rows": {}}
     for name in ("trot_velocity", "bound_velocity"):
+        print(f"{name}: 24 variables")
         log = record_box(name, seconds)
         result["box"][name] = box_single(log, peers)
         result["box"][name] |= box_in_scan(log)
         sizes = BATCHES[:4] if quick else BATCHES
         result["batch"][name] = box_batch(log, peers, sizes)
     for variables, steps in HORIZONS.items():
+        print(f"trot_velocity_long: {variables} variables")
         log = record_box("trot_velocity_long", 0.5, {"lmpc.horizon": steps})
         result["size"][variables] = box_single(log, peers, count=50)
     result["size"][24] = result["box"]["trot_velocity"]
+    print("bound_multiphase: rows")
     result["rows"] = rows_single(record_rows(seconds), peers)
     (folder / "table.md").write_text(table(result), encoding="utf-8")
     figure(result, folder / "figure.png")
@@ -483,11 +486,11 @@ def rows_single(problems: list[Any], peers: dict[str, Any], count: int = 300) ->
         import proxsuite
 
         prox = proxsuite.proxqp.dense.QP(n, 0, m, True)
-        prox.init(*clip[0][:2], None, None, *clip[0][2:])
+        prox.init(*problems[0][:2], None, None, *problems[0][2:])  # it wants its infinities
         prox.settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
 
         def by_proxqp(i: int) -> Any:
-            prox.update(*clip[i][:2], None, None, *clip[i][2:])
+            prox.update(*problems[i][:2], None, None, *problems[i][2:])
             prox.solve()
             return prox.results.x
 
