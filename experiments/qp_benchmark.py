@@ -5,30 +5,20 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
-import mujoco
 import numpy as np
-from tqdm import tqdm
+from qp_peers import box_peers, daqp_cold
+from qp_problems import record_box, record_rows
 
-from kjax import cli, planning, qp
-from kjax.config import RunConfig, load_config
-from kjax.controller import build_controller
-from kjax.mpc import lmpc, multiphase
-from kjax.sim.episode import initial_state
-from kjax.sim.mujoco_loop import build_simulation
+from kjax import cli, qp
 
-CONFIGS = Path(__file__).parents[1] / "configs"
 BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
 HORIZONS = {40: 10, 80: 20, 200: 50}  # variables: steps of 20 ms of the long trot
 ROUNDS = 3  # of every timing; the medians over all calls are reported
 PEERS = ("daqp", "quadprog", "osqp", "proxsuite", "piqp", "clarabel", "qpSWIFT", "qpax")
-
-Box = tuple[np.ndarray, ...]  # H, q, lower, upper
-Solver = Callable[..., np.ndarray]
 
 
 def run(folder: Path, *, quick: bool) -> dict[str, Any]:
@@ -64,231 +54,6 @@ def _import(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         return None
-
-
-# ---------------------------------------------------------------- problems from closed loops
-
-
-def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
-    """What ``planner`` returns as memory along a walk of the config's own controller."""
-    simulation = build_simulation(config)
-    controller, params, model = simulation.controller, simulation.params, simulation.model
-    recorder = build_controller(config, planner)
-    plan, act = jax.jit(controller.plan), jax.jit(controller.act)
-    look = jax.jit(lambda state, seen: recorder.plan(params, state, seen)[0].memory)
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
-    mujoco.mj_forward(model, data)
-    state, kept = None, []
-    steps = round(seconds / config.sim.sim_dt)
-    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    for i in tqdm(range(steps), desc="walking", leave=False, disable=None):
-        seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
-        if state is None:
-            state = controller.init(params, seen)
-        if i % per_tick == 0:
-            kept.append(jax.tree.map(np.array, look(state, seen)))
-            state, _ = plan(params, state, seen)
-        state, torque = act(params, state, seen)
-        data.ctrl[simulation.addresses.actuator.reshape(-1)] = np.asarray(torque).reshape(-1)
-        mujoco.mj_step(model, data)
-    return kept
-
-
-def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
-    config = load_config(RunConfig, CONFIGS / f"{name}.toml", changes or {})
-    own = planning.build_planner(config)
-
-    def planner(params: Any, task: Any) -> Any:
-        seen: dict[str, Any] = {}
-
-        def solve(prepared: Any, q: Any, lower: Any, upper: Any, *args: Any, **options: Any) -> Any:
-            seen.update(q=q, lower=lower, upper=upper)
-            return real(prepared, q, lower, upper, *args, **options)
-
-        real = qp.solve
-        with mock.patch.object(lmpc.qp, "solve", solve):
-            plan = own(params, task)
-        return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
-
-    mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
-    hessian = build_simulation(config).params.tables.hessian
-    H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
-    used = (upper > lower).any(axis=1)  # nothing is planned in flight
-    return {
-        "prepared": jax.device_put(hessian),
-        "mode": mode[used],
-        "H": H,
-        "q": q[used],
-        "lower": lower[used],
-        "upper": upper[used],
-    }
-
-
-def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
-    """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
-    config = load_config(RunConfig, CONFIGS / "bound_multiphase.toml", {})
-    own = planning.build_planner(config)
-
-    def planner(params: Any, task: Any) -> Any:
-        seen: list[Any] = []
-
-        def solve(*args: Any, **options: Any) -> Any:
-            seen.append(args)
-            return real(*args, **options)
-
-        real = qp.solve_rows
-        # The planner holds both horizons behind a cond, whose tracers may not leave it.
-        with (
-            mock.patch.object(multiphase.qp, "solve_rows", solve),
-            mock.patch.object(planning.jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
-        ):
-            plan = own(params, task)
-        return plan._replace(memory=seen[0])
-
-    kept = _drive(config, planner, seconds)
-    return [problem for problem in kept if (problem[6] > problem[5]).any()]
-
-
-# ---------------------------------------------------------------- solvers
-
-
-def box_peers(peers: dict[str, Any]) -> dict[str, Callable[[np.ndarray], Solver]]:
-    """Per peer: from H to a call (q, lower, upper) -> x; what it may keep of H, it keeps."""
-    made: dict[str, Callable[[np.ndarray], Solver]] = {}
-    if "daqp" in peers:
-        made["daqp, cold"] = _daqp_cold
-        made["daqp, warm"] = _daqp_warm
-    if "quadprog" in peers:
-        made["quadprog"] = _quadprog
-    if "osqp" in peers:
-        made["OSQP 1e-6"] = _osqp
-    # ProxQP takes part with rows only: 0.8 ends the process on these boxes with equal bounds.
-    if "piqp" in peers:
-        made["PIQP"] = _piqp
-    if "clarabel" in peers:
-        made["Clarabel"] = _clarabel
-    if "qpSWIFT" in peers:
-        made["qpSWIFT"] = _qpswift
-    if "qpax" in peers:
-        made["qpax"] = _qpax
-    return made
-
-
-def _daqp_cold(H: np.ndarray) -> Solver:
-    import daqp
-
-    n = len(H)
-    none, sense = np.zeros((0, n)), np.zeros(n, np.int32)
-    return lambda q, lower, upper: daqp.solve(H, q, none, upper, lower, sense)[0]
-
-
-def _daqp_warm(H: np.ndarray) -> Solver:
-    import daqp
-
-    n, model = len(H), None
-
-    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        nonlocal model
-        if model is None:
-            model = daqp.Model()
-            model.setup(H, q, np.zeros((0, n)), upper, lower, np.zeros(n, np.int32))
-        else:
-            model.update(f=q)
-        return model.solve()[0]
-
-    return call
-
-
-def _quadprog(H: np.ndarray) -> Solver:
-    import quadprog
-
-    n = len(H)
-    sides = np.hstack([np.eye(n), -np.eye(n)])
-
-    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        # Equal bounds as two inequalities it calls inconsistent; 1e-9 N between them it solves.
-        apart = np.where(lower == upper, 1e-9, 0.0)
-        return quadprog.solve_qp(H, -q, sides, np.r_[lower - apart, -upper])[0]
-
-    return call
-
-
-def _osqp(H: np.ndarray) -> Solver:
-    import osqp
-    from scipy import sparse
-
-    n, model = len(H), None
-
-    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        nonlocal model
-        if model is None:
-            model = osqp.OSQP()
-            model.setup(
-                sparse.csc_matrix(np.triu(H)), q, sparse.eye(n, format="csc"), lower, upper,
-                verbose=False, eps_abs=1e-6, eps_rel=1e-6,
-            )  # fmt: skip
-        else:
-            model.update(q=q, l=lower, u=upper)
-        return model.solve().x
-
-    return call
-
-
-def _piqp(H: np.ndarray) -> Solver:
-    import piqp
-
-    rows = np.eye(len(H))
-
-    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        model = piqp.DenseSolver()
-        model.setup(H, q, None, None, rows, lower, upper)  # equal x_l, x_u it calls infeasible
-        model.solve()
-        return model.result.x
-
-    return call
-
-
-def _clarabel(H: np.ndarray) -> Solver:
-    import clarabel
-    from scipy import sparse
-
-    n = len(H)
-    P = sparse.csc_matrix(np.triu(H))
-    A = sparse.vstack([sparse.eye(n), -sparse.eye(n)], format="csc")
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-
-    def call(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        cones = [clarabel.NonnegativeConeT(2 * n)]
-        model = clarabel.DefaultSolver(P, q, A, np.r_[upper, -lower], cones, settings)
-        return np.asarray(model.solve().x)
-
-    return call
-
-
-def _qpswift(H: np.ndarray) -> Solver:
-    import qpSWIFT
-
-    G = np.vstack([np.eye(len(H)), -np.eye(len(H))])
-    return lambda q, lower, upper: qpSWIFT.run(q, np.r_[upper, -lower], H, G)["sol"]
-
-
-def _qpax(H: np.ndarray) -> Solver:
-    import qpax
-
-    n = len(H)
-    solve = jax.jit(
-        lambda q, lower, upper: qpax.solve_qp(
-            jnp.asarray(H), q, jnp.zeros((0, n)), jnp.zeros(0),
-            jnp.concatenate([jnp.eye(n), -jnp.eye(n)]), jnp.concatenate([upper, -lower]),
-        )[0]
-    )  # fmt: skip
-    return lambda q, lower, upper: np.asarray(solve(q, lower, upper))
-
-
-# ---------------------------------------------------------------- measurements
 
 
 def _timed(call: Callable[[int], Any], indices: Any) -> float:
@@ -419,7 +184,7 @@ def box_batch(log: dict[str, Any], peers: dict[str, Any], sizes: Any) -> dict[st
         return qp.solve(prepared, q, lower, upper, index=mode).x
 
     batch = jax.jit(jax.vmap(one))
-    solvers = {int(m): _daqp_cold(log["H"][m]) for m in np.unique(log["mode"])}
+    solvers = {int(m): daqp_cold(log["H"][m]) for m in np.unique(log["mode"])}
     result: dict[str, Any] = {}
     for size in sizes:
         pick = rng.choice(len(log["q"]), size)

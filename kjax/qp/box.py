@@ -12,12 +12,20 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from kjax.qp.batching import in_chunks, where_needed
 from kjax.qp.first_order import FIRST_ORDER, descend
-from kjax.qp.problem import Prepared, Solution, Status, Warm, natural_residual, start, swept
+from kjax.qp.problem import (
+    Prepared,
+    Solution,
+    Status,
+    Warm,
+    natural_residual,
+    no_tangent,
+    start,
+    swept,
+)
 from kjax.qp.tableau import Pivoted, pivot
 
 Method = Literal["tableau", "admm", "projected_gradient"]
@@ -135,7 +143,7 @@ def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Solut
     good = solution.status <= Status.ITERATION_LIMIT
     dx = jnp.where(good, jnp.where(side == 0, out, move) * d, 0.0)
     dy = jnp.where(good & (side != 0), -(out + push) / d, 0.0)
-    still = jax.tree.map(_no_tangent, solution)
+    still = jax.tree.map(no_tangent, solution)
     return solution, still._replace(x=dx, multipliers=dy)
 
 
@@ -152,12 +160,6 @@ def _active_set(
 
 def _pick(stack: Any, index: Array) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], stack)
-
-
-def _no_tangent(leaf: Array) -> Any:
-    if jnp.issubdtype(leaf.dtype, jnp.floating):
-        return jnp.zeros_like(leaf)
-    return np.zeros(leaf.shape, jax.dtypes.float0)
 
 
 def _solve(

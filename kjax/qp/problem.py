@@ -9,10 +9,11 @@ the unit of x does.
 """
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -178,6 +179,13 @@ def swept(H: Float[Array, "n n"], free: Bool[Array, "n"]) -> Float[Array, "n n"]
     right = inverse @ H
     cross = jnp.outer(free, ~free).astype(H.dtype) * right
     return inverse - cross + cross.T + neither * (H - H @ right)
+
+
+def no_tangent(leaf: Array) -> Any:
+    """The tangent of a result that has no derivative."""
+    if jnp.issubdtype(leaf.dtype, jnp.floating):
+        return jnp.zeros_like(leaf)
+    return np.zeros(leaf.shape, jax.dtypes.float0)
 
 
 def kkt_residual(

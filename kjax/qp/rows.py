@@ -14,13 +14,12 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float, Int
 
 from kjax.qp.active_set import take_in_rows
 from kjax.qp.interior import descend_central_path
-from kjax.qp.problem import Status
+from kjax.qp.problem import Status, no_tangent
 from kjax.qp.row_problem import residuals, scale_rows
 
 RowMethod = Literal["interior_point", "active_set"]
@@ -139,7 +138,7 @@ def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, 
     scaled = 0.5 * (H + H.T) * d[:, None] * d
     scaled = jnp.where(good, scaled, jnp.eye(n, dtype=q.dtype))
     dx, dy = _equations(jax.lax.stop_gradient(scaled), jax.lax.stop_gradient(rows), push, shift)
-    still = jax.tree.map(_no_tangent, solution)
+    still = jax.tree.map(no_tangent, solution)
     return solution, still._replace(
         x=jnp.where(good, dx * d, 0.0), multipliers=jnp.where(active, dy / length, 0.0)
     )
@@ -163,12 +162,6 @@ def _equations(H: Array, rows: Array, push: Array, shift: Array) -> tuple[Array,
         dx = dx + step
         dy = dy + stiff * (miss + rows @ step)
     return dx, dy
-
-
-def _no_tangent(leaf: Array) -> Any:
-    if jnp.issubdtype(leaf.dtype, jnp.floating):
-        return jnp.zeros_like(leaf)
-    return np.zeros(leaf.shape, jax.dtypes.float0)
 
 
 def _solve(

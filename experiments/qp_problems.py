@@ -1,0 +1,101 @@
+"""The QPs of closed loops, recorded by standing in for the solver while the planner is traced."""
+
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import jax
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+from kjax import planning, qp
+from kjax.config import RunConfig, load_config
+from kjax.controller import build_controller
+from kjax.mpc import lmpc, multiphase
+from kjax.sim.episode import initial_state
+from kjax.sim.mujoco_loop import build_simulation
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+
+
+def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
+    """What ``planner`` returns as memory along a walk of the config's own controller."""
+    simulation = build_simulation(config)
+    controller, params, model = simulation.controller, simulation.params, simulation.model
+    recorder = build_controller(config, planner)
+    plan, act = jax.jit(controller.plan), jax.jit(controller.act)
+    look = jax.jit(lambda state, seen: recorder.plan(params, state, seen)[0].memory)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+    mujoco.mj_forward(model, data)
+    state, kept = None, []
+    steps = round(seconds / config.sim.sim_dt)
+    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    for i in tqdm(range(steps), desc="walking", leave=False, disable=None):
+        seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
+        if state is None:
+            state = controller.init(params, seen)
+        if i % per_tick == 0:
+            kept.append(jax.tree.map(np.array, look(state, seen)))
+            state, _ = plan(params, state, seen)
+        state, torque = act(params, state, seen)
+        data.ctrl[simulation.addresses.actuator.reshape(-1)] = np.asarray(torque).reshape(-1)
+        mujoco.mj_step(model, data)
+    return kept
+
+
+def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
+    config = load_config(RunConfig, CONFIGS / f"{name}.toml", changes or {})
+    own = planning.build_planner(config)
+
+    def planner(params: Any, task: Any) -> Any:
+        seen: dict[str, Any] = {}
+
+        def solve(prepared: Any, q: Any, lower: Any, upper: Any, *args: Any, **options: Any) -> Any:
+            seen.update(q=q, lower=lower, upper=upper)
+            return real(prepared, q, lower, upper, *args, **options)
+
+        real = qp.solve
+        with mock.patch.object(lmpc.qp, "solve", solve):
+            plan = own(params, task)
+        return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
+
+    mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
+    hessian = build_simulation(config).params.tables.hessian
+    H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
+    used = (upper > lower).any(axis=1)  # nothing is planned in flight
+    return {
+        "prepared": jax.device_put(hessian),
+        "mode": mode[used],
+        "H": H,
+        "q": q[used],
+        "lower": lower[used],
+        "upper": upper[used],
+    }
+
+
+def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
+    """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
+    config = load_config(RunConfig, CONFIGS / "bound_multiphase.toml", {})
+    own = planning.build_planner(config)
+
+    def planner(params: Any, task: Any) -> Any:
+        seen: list[Any] = []
+
+        def solve(*args: Any, **options: Any) -> Any:
+            seen.append(args)
+            return real(*args, **options)
+
+        real = qp.solve_rows
+        # The planner holds both horizons behind a cond, whose tracers may not leave it.
+        with (
+            mock.patch.object(multiphase.qp, "solve_rows", solve),
+            mock.patch.object(planning.jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
+        ):
+            plan = own(params, task)
+        return plan._replace(memory=seen[0])
+
+    kept = _drive(config, planner, seconds)
+    return [problem for problem in kept if (problem[6] > problem[5]).any()]
