@@ -253,6 +253,7 @@ def rows_single(problems: list[Any], peers: dict[str, Any], count: int = 300) ->
         prox = proxsuite.proxqp.dense.QP(n, 0, m, True)
         prox.init(*problems[0][:2], None, None, *problems[0][2:])  # it wants its infinities
         prox.settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
+        prox.settings.max_iter = 200  # by default 10,000: some of these take seconds then
 
         def by_proxqp(i: int) -> Any:
             prox.update(*problems[i][:2], None, None, *problems[i][2:])
