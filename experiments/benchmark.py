@@ -4,6 +4,8 @@ controller: latency of plan and act in the single-robot loop, beside an empty ji
 same signature and the bare physics step; real-time factor; first and second start of the main job.
 qp: the QP solvers on the QPs of closed loops, beside daqp, quadprog, OSQP, ProxQP, PIQP, Clarabel,
 qpSWIFT and qpax, as far as these are installed; single, in a scan and batched.
+simulation: closed loops per second on C MuJoCo and on MJX against the number of robots, beside the
+bare engines and a Python loop over single robots; compile time, memory, two processes against one.
 """
 
 import json
@@ -20,6 +22,7 @@ import jax
 import mujoco
 import numpy as np
 import qp_benchmark
+import simulation_benchmark
 
 from kjax import cli
 from kjax.config import RunConfig
@@ -27,7 +30,8 @@ from kjax.sim.episode import initial_state, metrics
 from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
 from kjax.sim.observe import noise_dim
 
-BENCHMARKS = ("controller", "qp")
+STUDIES = {"qp": qp_benchmark, "simulation": simulation_benchmark}
+BENCHMARKS = ("controller", *STUDIES)
 CALLS = 2000  # timed calls of each function
 WALK = 400  # ms of walking from which the timed inputs are taken
 
@@ -37,8 +41,8 @@ def main() -> None:
     words = sys.argv[1:]
     if not words or words[0] not in (*BENCHMARKS, "-h", "--help"):
         cli.fail(f"which benchmark? one of: {', '.join(BENCHMARKS)}")
-    if words[0] == "qp":
-        qp_solvers(words[1:])
+    if words[0] in STUDIES:
+        study(words[0], words[1:])
         return
     parser = cli.build_parser(RunConfig, __doc__)
     parser.prog = f"benchmark.py {words[0]}"
@@ -58,18 +62,18 @@ def main() -> None:
     print(f"results in {folder}/")
 
 
-def qp_solvers(words: list[str]) -> None:
-    """The solvers beside their peers; see qp_benchmark.py."""
+def study(name: str, words: list[str]) -> None:
+    """One of the benchmarks with a module of its own."""
     parser = cli.script_parser(__doc__)
-    parser.prog = "benchmark.py qp"
-    parser.add_argument("--quick", action="store_true", help="1 s of walking, small batches")
+    parser.prog = f"benchmark.py {name}"
+    parser.add_argument("--quick", action="store_true", help="less of it: to check the script")
     args = parser.parse_args(words)
-    args.out = args.out or Path("results") / "benchmark_qp"
+    args.out = args.out or Path("results") / f"benchmark_{name}"
     args.config = None
-    folder = cli.output_folder(args, "benchmark_qp")
-    cli.configure_jax(one_core=True)
-    result = qp_benchmark.run(folder, quick=args.quick)
-    qp_benchmark.save(folder, result)
+    folder = cli.output_folder(args, f"benchmark_{name}")
+    cli.configure_jax(one_core=name == "qp")
+    result = STUDIES[name].run(folder, quick=args.quick)
+    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"results in {folder}/")
 

@@ -13,7 +13,7 @@ import numpy as np
 from qp_peers import box_peers, daqp_cold
 from qp_problems import record_box, record_rows
 
-from kjax import cli, qp
+from kjax import qp
 
 BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
 HORIZONS = {40: 10, 80: 20, 200: 50}  # variables: steps of 20 ms of the long trot
@@ -329,8 +329,3 @@ def figure(result: dict[str, Any], path: Path) -> None:
     right.legend(fontsize=8)
     fig.savefig(path, dpi=120)
     plt.close(fig)
-
-
-def save(folder: Path, result: dict[str, Any]) -> None:
-    """JSON beside the figure."""
-    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})

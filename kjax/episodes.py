@@ -31,7 +31,7 @@ Run = Callable[..., list[dict[str, Any] | None]]
 Task = tuple[str, tuple[RunConfig, Record | None, Path]]  # key, arguments of ``_episode``
 
 _HERE = Path(__file__).resolve().parent
-_NO_PHYSICS = ("viz", "cli.py", "episodes.py")  # what cannot change an episode
+_NO_PHYSICS = ("viz", "sweep", "cli.py", "episodes.py")  # what cannot change an episode
 
 
 def code_version() -> str:

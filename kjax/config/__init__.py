@@ -16,12 +16,15 @@ from kjax.config.loading import ConfigError, fields, load_config, to_dict
 from kjax.config.model import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.config.run import FitStudyConfig, RunConfig
 from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
+from kjax.config.sweep import AxisConfig, FigureConfig, SweepConfig
 
 __all__ = [
+    "AxisConfig",
     "BoundConfig",
     "CommandConfig",
     "ConfigError",
     "DatasetConfig",
+    "FigureConfig",
     "FitStudyConfig",
     "GaitConfig",
     "KoopmanConfig",
@@ -34,6 +37,7 @@ __all__ = [
     "RunConfig",
     "SimConfig",
     "SrbConfig",
+    "SweepConfig",
     "TerrainConfig",
     "fields",
     "load_config",

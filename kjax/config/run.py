@@ -59,6 +59,8 @@ class RunConfig:
             "lmpc.model_dt", self.lmpc.model_dt, "koopman.dataset.dt", self.koopman.dataset.dt
         )
         require_multiple("push.duration", self.push.duration, "sim.sim_dt", self.sim.sim_dt)
+        if self.sim.delay:
+            require_multiple("sim.delay", self.sim.delay, "sim.sim_dt", self.sim.sim_dt)
         lateral = self.push.lateral
         if self.sim.base == "planar" and any(lateral if isinstance(lateral, tuple) else [lateral]):
             raise ValueError(f"push.lateral needs sim.base = 'free', got {lateral} and 'planar'")

@@ -111,5 +111,9 @@ class SimConfig:
     """Viscous joint damping [N m s/rad]."""
     joint_armature: NonNegative = 0.01
     """Reflected rotor inertia [kg m^2]."""
+    payload: NonNegative = 0.0
+    """Mass on the trunk, at its centre of mass, that the controller knows nothing of [kg]."""
+    delay: NonNegative = 0.0
+    """Time from a torque's computation to its effect, a multiple of sim_dt [s]."""
     contact_threshold: NonNegative = 5.0
     """Foot force above which the contact sensor fires [N]."""

@@ -1,6 +1,5 @@
 """What an episode starts from and what it leaves: initial state, noise, trajectory, metrics."""
 
-import functools
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from kjax import qp
 from kjax.config import CommandConfig, NoiseConfig, PushConfig, RunConfig, TerrainConfig
@@ -25,9 +25,10 @@ LATE_TIME = 2.0  # s after the last change of command, for what should be steady
 
 @dataclass(kw_only=True)
 class Trajectory:
-    """One robot's episode; arrays at the physics rate (N,) unless said otherwise.
+    """One robot's episode; arrays (N,) at the physics rate, from a batch at the control rate.
 
     Attributes:
+      dt: time between two samples [s].
       time: [s].
       qpos: (N, nq) positions of the model.
       qvel: (N, nv) velocities of the model.
@@ -40,17 +41,19 @@ class Trajectory:
       force: (N, 4, 2) planned force on each leg, body frame [N].
       velocity_command: (N,) [m/s].
       velocity_reference: (N,) what the LMPC tracks: the command at a bounded rate [m/s].
-      body_contact: (P,) whether anything but a foot touches the world at a control tick.
+      body_contact: (P,) whether anything but a foot touches the world at a control tick; from a
+        batch (0,).
       plan_status: (P,) ``qp.Status`` of each plan.
       plan_residual: (P,) KKT residual [-].
       plan_iterations: (P,) solver iterations.
-      plan_time: (P,) wall time of each call [s].
-      act_time: (N,) wall time of each call [s].
-      wall_time: of the whole loop [s].
+      plan_time: (P,) wall time of each call [s]; from a batch (0,).
+      act_time: (N,) wall time of each call [s]; from a batch (0,).
+      wall_time: of the whole loop [s]; from a batch the time of all of it.
       fell: whether the robot fell (the episode ends there).
       interrupted: whether the user stopped the run.
     """
 
+    dt: float
     time: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
@@ -82,7 +85,12 @@ class Trajectory:
         """Read what ``save`` wrote."""
         with np.load(path) as data:
             values: dict[str, Any] = {f.name: data[f.name] for f in fields(cls)}
-        for name, kind in (("wall_time", float), ("fell", bool), ("interrupted", bool)):
+        for name, kind in (
+            ("dt", float),
+            ("wall_time", float),
+            ("fell", bool),
+            ("interrupted", bool),
+        ):
             values[name] = kind(values[name])
         return cls(**values)
 
@@ -91,8 +99,8 @@ def fixed_part(config: RunConfig) -> RunConfig:
     """The config without what may differ between the episodes of one compiled simulation.
 
     That is the seed, duration, noise, pushes, times and speeds of the command, times of the gaits,
-    friction, and the terrain's seed and sizes. Configs with the same fixed part share a
-    ``mujoco_loop.Simulation``.
+    friction, payload, delay, and the terrain's seed and sizes. Configs with the same fixed part
+    share a ``mujoco_loop.Simulation``.
     """
     pieces = tuple(map(float, range(len(config.command.times))))
     return replace(
@@ -103,7 +111,7 @@ def fixed_part(config: RunConfig) -> RunConfig:
         push=PushConfig(),
         command=CommandConfig(times=pieces, velocities=pieces),
         gait=replace(config.gait, times=tuple(map(float, range(len(config.gait.times))))),
-        sim=replace(config.sim, friction=1.0),
+        sim=replace(config.sim, friction=1.0, payload=0.0, delay=0.0),
         terrain=TerrainConfig(kind=config.terrain.kind, count=config.terrain.count),
     )
 
@@ -138,23 +146,25 @@ def sensor_noise(config: RunConfig, steps: int, start: int = 0) -> np.ndarray:
     scale = noise_scale(config.noise, config.sim.base)
     if not scale.any():
         return np.zeros((steps, len(scale)))
-    numbers = np.arange(start, start + steps)
+    numbers = np.arange(start, start + steps, dtype=np.int32)
+    rows = _noise_rows(np.int32(config.seed), numbers, config.sim.base)
+    return np.asarray(rows, float) * scale
+
+
+def noise_row(seed: Int[jax.Array, ""], step: Int[jax.Array, ""], base: str) -> jax.Array:
+    """Standard normal vector (n,) of an episode's step, float32."""
     streams = [(1, NOISE_DIM)]
-    if config.sim.base == "free":
+    if base == "free":
         streams.append((2, noise_dim("free") - NOISE_DIM))  # its own: the rest is the planar one's
-    key = jax.random.key(config.seed)
-    drawn = [_normals(jax.random.fold_in(key, name), numbers, n) for name, n in streams]
-    return np.concatenate([np.asarray(part, float) for part in drawn], axis=1) * scale
+
+    def draw(name: int, size: int) -> jax.Array:
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), name), step)
+        return jax.random.normal(key, (size,), jnp.float32)
+
+    return jnp.concatenate([draw(name, size) for name, size in streams])
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _normals(key: jax.Array, steps: jax.Array, size: int) -> jax.Array:
-    """Standard normal vectors (steps, size), one stream per step."""
-
-    def one(step: jax.Array) -> jax.Array:
-        return jax.random.normal(jax.random.fold_in(key, step), (size,), jnp.float32)
-
-    return jax.vmap(one)(steps)
+_noise_rows = jax.jit(jax.vmap(noise_row, in_axes=(None, 0, None)), static_argnums=2)
 
 
 def sagittal(observe: Observe, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -185,7 +195,7 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         "fell": run.fell,
         "fall_time_s": float(run.time[-1]) if run.fell else None,
         "interrupted": run.interrupted,
-        "simulated_s": float(len(run.time) * config.sim.sim_dt),
+        "simulated_s": float(len(run.time) * run.dt),
     }
     if not steady.any():
         return result
@@ -208,7 +218,7 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         **_crossing(run, config),
         **_switching(run, config),
         **free_base.metrics(run.qpos, steady),
-        "foot_slip_m": foot_slip(run, config.sim.sim_dt, config.sim.contact_threshold),
+        "foot_slip_m": foot_slip(run, run.dt, config.sim.contact_threshold),
         "torque_max_nm": float(np.abs(run.torque).max()),
         "torque_saturation_fraction": float(saturated.any(axis=(1, 2)).mean()),
         **{
@@ -216,16 +226,21 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
             for name, value in zip(("abduction", "thigh", "knee"), joints, strict=True)
         },
         "body_contact_fraction": (
-            float(run.body_contact.mean()) if config.sim.contacts == "all" else None
+            float(run.body_contact.mean())
+            if config.sim.contacts == "all" and len(run.body_contact)
+            else None
         ),
         "qp_unsolved": int(unsolved.sum()),
         "qp_iterations_median": float(np.median(run.plan_iterations)),
-        "plan_ms_median": float(1e3 * np.median(run.plan_time)),
-        "plan_ms_p99": float(1e3 * np.percentile(run.plan_time, 99)),
-        "act_ms_median": float(1e3 * np.median(run.act_time)),
-        "act_ms_p99": float(1e3 * np.percentile(run.act_time, 99)),
-        "realtime_factor": float(len(run.time) * config.sim.sim_dt / run.wall_time),
     }
+    if len(run.plan_time):
+        result |= {
+            "plan_ms_median": float(1e3 * np.median(run.plan_time)),
+            "plan_ms_p99": float(1e3 * np.percentile(run.plan_time, 99)),
+            "act_ms_median": float(1e3 * np.median(run.act_time)),
+            "act_ms_p99": float(1e3 * np.percentile(run.act_time, 99)),
+            "realtime_factor": float(len(run.time) * run.dt / run.wall_time),
+        }
     return result
 
 
@@ -280,9 +295,9 @@ def _switching(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         return {}
     at = changes[np.searchsorted(run.time[changes], config.gait.times[-1] - 1e-9)]
     pitch = np.degrees(np.abs(run.x[at:, 2]))
-    last = pitch[-round(1.0 / config.sim.sim_dt) :]
+    last = pitch[-round(1.0 / run.dt) :]
     outside = np.flatnonzero(pitch > max(3.0, 1.1 * float(last.max())))
-    settled = (outside[-1] + 1) * config.sim.sim_dt if len(outside) else 0.0
+    settled = (outside[-1] + 1) * run.dt if len(outside) else 0.0
     return {
         "switch_time_s": float(run.time[at]),
         "switch_pitch_max_deg": float(pitch.max()),

@@ -1,56 +1,59 @@
-"""The same closed loop inside ``lax.scan`` on MJX: physics, phase clock, QP and legs in one jit.
+"""Many robots on MJX: physics, phase clock, QP and legs of a whole batch in one compiled program.
 
 Outer scan over control ticks, inner scan over physics steps, so that a plan is computed where it
-is due and nowhere else, also under ``vmap``.
+is due and nowhere else, also under ``vmap``. What differs between the robots' models (terrain,
+friction, masses) is batched; everything else is held once.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 from mujoco import mjx
 
 from kjax.config import RunConfig
-from kjax.controller import Controller, ControllerState, PlanInfo
 from kjax.params import ControllerParams
-from kjax.sim.observe import add_noise, build_observe, resolve
-from kjax.sim.push import push_force, pushed_body
+from kjax.sim.batch_loop import (
+    OnProgress,
+    Torques,
+    dressed,
+    require_one_batch,
+    ticks_of,
+)
+from kjax.sim.cases import Case, batch_part, push_at, stack_cases, stack_params
+from kjax.sim.episode import initial_state
+from kjax.sim.observe import resolve
+from kjax.sim.push import pushed_body
+from kjax.sim.recording import Recording
 from kjax.sim.scene import build_spec
+from kjax.sim.walk import Sensed, TickLog, WalkState, build_walk
+
+_PIECE = 50  # control ticks of one compiled call; between two of them Ctrl-C and progress
 
 
-class MjxLog(NamedTuple):
-    """What a run records; T ticks of S physics steps.
+class MjxTick(NamedTuple):
+    """What is recorded of a control tick, at its beginning, and the torque in its first step."""
 
-    Attributes:
-      qpos: (T, S, nq) before each physics step.
-      qvel: (T, S, nv) before each physics step.
-      torque: (T, S, 4, 3) applied in it [N m].
-      info: of every plan, leading axis T.
-    """
-
-    qpos: Float[Array, "T S nq"]
-    qvel: Float[Array, "T S nv"]
-    torque: Float[Array, "T S 4 3"]
-    info: PlanInfo
+    qpos: Float[Array, "nq"]
+    qvel: Float[Array, "nv"]
+    torque: Float[Array, "12"]
+    alive: Array
+    log: TickLog
 
 
-class MjxSimulation(NamedTuple):
-    """Functions of one scene and controller on MJX.
+class MjxState(NamedTuple):
+    """What is carried: MJX's data, the robot's state, torques under way (D, nu), steps done."""
 
-    Attributes:
-      model: the C model that MJX's was made from.
-      reset: (qpos, qvel) -> data, kinematics and sensors evaluated.
-      run: (params, controller state, data, noise (T, S, 30 or 36)) -> (state, data, log).
-    """
-
-    model: mujoco.MjModel
-    reset: Callable[[Array, Array], Any]
-    run: Callable[
-        [ControllerParams, ControllerState, Any, Array], tuple[ControllerState, Any, MjxLog]
-    ]
+    data: Any
+    walk: WalkState
+    under_way: Float[Array, "D nu"]
+    step: Array
 
 
 def build_model(config: RunConfig) -> mujoco.MjModel:
@@ -60,53 +63,254 @@ def build_model(config: RunConfig) -> mujoco.MjModel:
             "MJX needs sim.contacts = 'feet' and sim.cone = 'pyramidal', got "
             f"'{config.sim.contacts}' and '{config.sim.cone}'"
         )
-    spec = build_spec(config.sim, config.terrain)
+    spec = build_spec(config.sim, config.terrain, visual=False)
     spec.option.iterations = 6
     spec.option.ls_iterations = 8
     return spec.compile()
 
 
-def build_mjx(config: RunConfig, controller: Controller) -> MjxSimulation:
-    """Reset and run functions for a config; the caller jits and vmaps them."""
-    model = build_model(config)
-    mjx_model = mjx.put_model(model)
-    observe = build_observe(model, config.sim.contact_threshold)
-    actuators = resolve(model).actuator.reshape(-1)
-    pushed = pushed_body(model)
+class MjxEngine:
+    """MJX for batches of configs with one ``cases.batch_part``; the same calls as ``BatchEngine``.
 
-    def reset(qpos: Array, qvel: Array) -> Any:
-        data = mjx.make_data(mjx_model)
+    Compiles once per number of robots and kind of difference between them. A batch whose number of
+    robots is a multiple of the number of local devices is sharded over them.
+
+    Attributes:
+      part: what all configs have in common.
+      model: the C model that MJX's was made from.
+      torques: see ``batch_loop.BatchEngine``.
+      traces: how often the program has been traced.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        *,
+        torques: Torques = "every_step",
+        dtype: Any = np.float32,
+        impl: str | None = None,
+    ):
+        """Scene and functions; nothing is compiled yet.
+
+        Args:
+          config: one of those to come.
+          torques: ``"every_step"`` or ``"held"``.
+          dtype: floating type of controller and physics; float64 needs ``jax_enable_x64``.
+          impl: implementation of MJX, e.g. ``"warp"`` on an NVIDIA GPU; its own choice if ``None``.
+        """
+        if torques not in ("every_step", "held"):
+            raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
+        self.part, self.torques, self.dtype = batch_part(config), torques, np.dtype(dtype)
+        self.model = build_model(config)
+        self.traces = 0
+        self._mjx = self._cast(mjx.put_model(self.model, impl=impl))
+        self._impl = impl
+        self._walk = build_walk(
+            config, self.model, resolve(self.model).actuator, held=torques == "held"
+        )
+        self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+        self._calls: dict[Any, tuple[Callable[..., Any], Callable[..., Any]]] = {}
+
+    def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
+        """Closed loops of all configs, each until its end or its fall.
+
+        On Ctrl-C what was walked is returned, marked as interrupted.
+
+        Raises:
+          ValueError: for a config with another ``batch_part``, or other durations.
+        """
+        require_one_batch(self.part, configs, self.torques)
+        params, axes = stack_params(configs, self.dtype)
+        case, (own, own_axes) = stack_cases(configs), self._differences(configs)
+        starts = [initial_state(config, self.model.nq, self.model.nv) for config in configs]
+        qpos, qvel = (jnp.asarray(np.stack(a), self.dtype) for a in zip(*starts, strict=True))
+        delays = 1 + int(case.delay.max()) // (self._per_tick if self.torques == "held" else 1)
+        ticks = ticks_of(configs[0])
+        begin_call, walk_call = self._compiled(axes, own_axes, delays)
+        place = _sharding(len(configs))
+        batched = jax.device_put((case, qpos, qvel), place) if place else (case, qpos, qvel)
+        if place:
+            params, own = _spread(params, axes, place), jax.device_put(own, place)
+        case, qpos, qvel = batched
+        begin, pieces, interrupted = time.perf_counter(), [], False
+        state = begin_call(params, own, case, qpos, qvel)
+        try:
+            for done in range(0, ticks, _PIECE):
+                count = min(_PIECE, ticks - done)
+                # The last piece may be shorter than it is computed: one program for all.
+                state, piece = walk_call(params, own, case, state)
+                pieces.append(jax.device_get(jax.tree.map(lambda a, n=count: a[:n], piece)))
+                if on_progress is not None:
+                    on_progress((done + count) * len(configs), ticks * len(configs))
+                if not pieces[-1].alive[-1].any():
+                    break
+        except KeyboardInterrupt:
+            interrupted = True
+            if not pieces:
+                raise
+        record = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+        alive = np.asarray(record.alive)
+        fell = ~alive[-1]
+        legs = resolve(self.model).actuator.reshape(-1)
+        return Recording(
+            configs=list(configs),
+            dt=self.part.config.lmpc.control_dt,
+            ticks=np.where(fell, 1 + np.argmin(alive, axis=0), len(alive)),
+            fell=fell,
+            qpos=record.qpos,
+            qvel=record.qvel,
+            torque=record.torque[..., legs],
+            log=record.log,
+            wall_time=time.perf_counter() - begin,
+            interrupted=interrupted,
+        )
+
+    def _differences(self, configs: Sequence[RunConfig]) -> tuple[dict[str, Any], dict[str, int]]:
+        """Fields of MJX's model that differ between the robots, stacked."""
+        models = dressed(self.model, configs)
+        fields = {}
+        for name in _MODEL_FIELDS:
+            values = [getattr(model, name) for model in models]
+            if not all(np.array_equal(value, getattr(self.model, name)) for value in values):
+                fields[name] = np.stack(values)
+        cast = {name: jnp.asarray(value, self.dtype) for name, value in fields.items()}
+        return cast, dict.fromkeys(cast, 0)
+
+    def _cast(self, tree: Any) -> Any:
+        def leaf(a: Any) -> Any:
+            if isinstance(a, jax.Array) and jnp.issubdtype(a.dtype, jnp.floating):
+                return a.astype(self.dtype)
+            return a
+
+        return jax.tree.map(leaf, tree)
+
+    def _compiled(
+        self, axes: Any, own_axes: dict[str, int], delays: int
+    ) -> tuple[Callable[..., Any], Callable[..., Any]]:
+        """Jitted functions of a batch: begin, and walk a piece."""
+        leaves, tree = jax.tree.flatten(axes, is_leaf=lambda a: a is None)
+        key = (tuple(leaves), tree, tuple(own_axes), delays)
+        if key not in self._calls:
+
+            def begin(params: Any, own: Any, case: Case, qpos: Array, qvel: Array) -> MjxState:
+                return self._begin(params, own, case, qpos, qvel, delays)
+
+            def piece(params: Any, own: Any, case: Case, state: MjxState) -> Any:
+                self.traces += 1
+                return self._walk_piece(params, own, case, state)
+
+            self._calls[key] = (
+                jax.jit(jax.vmap(begin, (axes, own_axes, 0, 0, 0))),
+                jax.jit(jax.vmap(piece, (axes, own_axes, 0, 0), out_axes=(0, 1)), donate_argnums=3),
+            )
+        return self._calls[key]
+
+    def _begin(
+        self,
+        params: ControllerParams,
+        own: dict[str, Array],
+        case: Case,
+        qpos: Array,
+        qvel: Array,
+        delays: int,
+    ) -> MjxState:
+        data = self._cast(mjx.make_data(self._mjx, **_impl_argument(self._impl)))
         # Through .at[], since a replaced host array has another layout and compiles twice.
         data = data.replace(qpos=data.qpos.at[:].set(qpos), qvel=data.qvel.at[:].set(qvel))
-        return _same_types(mjx.forward(mjx_model, data), data)
+        data = _same_types(mjx.forward(self._mjx.replace(**own), data), data)
+        return MjxState(
+            data=data,
+            walk=self._walk.init(params, case, _sensed(data)),
+            under_way=jnp.zeros((delays, self.model.nu), self.dtype),
+            step=jnp.zeros((), jnp.int32),
+        )
 
-    def run(
-        params: ControllerParams, state: ControllerState, data: Any, noise: Array
-    ) -> tuple[ControllerState, Any, MjxLog]:
-        def sense(data: Any, noise: Array) -> Any:
-            return add_noise(observe(data.qpos, data.qvel, data.sensordata), noise)
+    def _walk_piece(
+        self, params: ControllerParams, own: dict[str, Array], case: Case, state: MjxState
+    ) -> tuple[MjxState, MjxTick]:
+        model, walk, per_tick = self._mjx.replace(**own), self._walk, self._per_tick
+        trunk, held = pushed_body(self.model), self.torques == "held"
 
-        def physics(carry: Any, noise: Array) -> Any:
-            state, data = carry
-            state, torque = controller.act(params, state, sense(data, noise))
-            ctrl = jnp.zeros_like(data.ctrl).at[actuators].set(torque.reshape(-1))
-            force = push_force(config.push, data.time, config.sim.sim_dt)
-            pushes = jnp.zeros_like(data.xfrc_applied).at[pushed, :3].set(force)
-            moved = mjx.step(mjx_model, data.replace(ctrl=ctrl, xfrc_applied=pushes))
-            return (state, _same_types(moved, data)), (data.qpos, data.qvel, torque)
+        def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
+            push = push_at(case, step, xp=jnp).astype(self.dtype)
+            pushes = jnp.zeros_like(data.xfrc_applied).at[trunk, :3].set(push)
+            moved = mjx.step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
+            # A robot that has fallen stays as it is, whatever its numbers have become.
+            return jax.tree.map(
+                lambda new, old: jnp.where(alive, new, old), _same_types(moved, data), data
+            )
 
-        def tick(carry: Any, noise: Array) -> Any:
-            state, data = carry
-            state, info = controller.plan(params, state, sense(data, noise[0]))
-            carry, (qpos, qvel, torque) = jax.lax.scan(physics, (state, data), noise)
-            return carry, MjxLog(qpos=qpos, qvel=qvel, torque=torque, info=info)
+        def delayed(under_way: Array, torque: Array, place: Array) -> tuple[Array, Array]:
+            count = under_way.shape[0]
+            if count == 1:
+                return under_way, torque
+            under_way = under_way.at[place % count].set(torque)
+            return under_way, under_way[(place - case.delay // (per_tick if held else 1)) % count]
 
-        (state, data), log = jax.lax.scan(tick, (state, data), noise)
-        return state, data, log
+        def step(carry: MjxState, _: None) -> tuple[MjxState, Array]:
+            data, robot, under_way, at = carry
+            robot, torque = walk.act(params, case, robot, at, _sensed(data))
+            under_way, applied = delayed(under_way, torque, at)
+            data = physics(data, applied, at, robot.alive)
+            return MjxState(data, robot, under_way, at + 1), torque
 
-    return MjxSimulation(model=model, reset=reset, run=run)
+        def tick(carry: MjxState, _: None) -> tuple[MjxState, MjxTick]:
+            data, robot, under_way, at = carry
+            robot, log = walk.plan(params, case, robot, at, _sensed(data))
+            carry = MjxState(data, robot, under_way, at)
+            if held:
+                robot, torque = walk.act(params, case, robot, at, _sensed(data))
+                under_way, applied = delayed(under_way, torque, at // per_tick)
+
+                def onward(data: Any, i: Array) -> tuple[Any, None]:
+                    return physics(data, applied, at + i, robot.alive), None
+
+                moved, _ = jax.lax.scan(onward, data, jnp.arange(per_tick, dtype=jnp.int32))
+                after = MjxState(moved, robot, under_way, at + per_tick)
+            else:
+                after, torques = jax.lax.scan(step, carry, None, length=per_tick)
+                torque = torques[0]
+            return after, MjxTick(data.qpos, data.qvel, torque, robot.alive, log)
+
+        return jax.lax.scan(tick, state, None, length=_PIECE)
+
+
+# What ``scene.dress`` may change, with what follows from it.
+_MODEL_FIELDS = (
+    "geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound", "geom_aabb",
+    "body_mass", "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0",
+    "actuator_acc0",
+)  # fmt: skip
+
+
+def _sensed(data: Any) -> Sensed:
+    return Sensed(data.qpos, data.qvel, data.sensordata)
 
 
 def _same_types(new: Any, old: Any) -> Any:
     """``new`` with the dtypes of ``old``: in float64 some contact ids change their width."""
     return jax.tree.map(lambda a, b: a.astype(b.dtype) if hasattr(a, "astype") else a, new, old)
+
+
+def _impl_argument(impl: str | None) -> dict[str, str]:
+    return {} if impl is None else {"impl": impl}
+
+
+def _sharding(robots: int) -> NamedSharding | None:
+    """The batch axis over all local devices; ``None`` where there is one, or it does not divide."""
+    devices = jax.local_devices()
+    if len(devices) == 1 or robots % len(devices):
+        return None
+    mesh = jax.sharding.Mesh(np.array(devices), ("robots",))
+    return NamedSharding(mesh, PartitionSpec("robots"))
+
+
+def _spread(params: ControllerParams, axes: Any, place: NamedSharding) -> ControllerParams:
+    """Parameters on all devices, those of single robots on the robot's own."""
+    everywhere = NamedSharding(place.mesh, PartitionSpec())
+    return jax.tree.map(
+        lambda axis, leaf: jax.device_put(leaf, everywhere if axis is None else place),
+        axes,
+        params,
+        is_leaf=lambda a: a is None,
+    )

@@ -18,7 +18,7 @@ from kjax.config import RunConfig
 from kjax.controller import Controller, ControllerState, build_controller
 from kjax.params import ControllerParams, build_params
 from kjax.robots import go1
-from kjax.sim import free_base, terrain
+from kjax.sim import free_base
 from kjax.sim.episode import (
     Trajectory,
     fallen,
@@ -29,8 +29,8 @@ from kjax.sim.episode import (
 )
 from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, noise_dim, resolve
 from kjax.sim.push import push_force, pushed_body
-from kjax.sim.scene import build_model
-from kjax.types import Command, Leg, Observation
+from kjax.sim.scene import build_model, dress, foot_geoms
+from kjax.types import Command, Observation
 
 # Called once per control tick with the steps done, the steps in all and the data; return value
 # ignored. For progress bars and viewers.
@@ -254,9 +254,8 @@ def simulate(
     field = config.terrain
     if terrain_seed is not None:
         field = dataclasses.replace(field, seed=terrain_seed)
-    terrain.place(model, terrain.generate(field, config.sim.friction))
-    soles = [model.geom(f"{leg.name}_foot").id for leg in Leg]
-    model.geom_friction[soles, 0] = config.sim.friction
+    dress(model, config.sim, field)
+    soles = foot_geoms(model)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
     mujoco.mj_forward(model, data)
@@ -283,6 +282,7 @@ def simulate(
     body_contact = np.zeros(ticks, bool)
     is_foot_or_world = model.geom_bodyid == 0
     is_foot_or_world[soles] = True
+    delay = round(config.sim.delay / config.sim.sim_dt)
     pushed = pushed_body(model)
     push = push_force(config.push, np.arange(steps) * config.sim.sim_dt, config.sim.sim_dt, np)
     logs: list[np.ndarray] = []
@@ -310,7 +310,7 @@ def simulate(
                 state, command = simulation.act(state, sensed)
                 torque[i] = command
                 act_time[i] = time.perf_counter() - clock
-                data.ctrl[actuators] = torque[i]
+                data.ctrl[actuators] = torque[i - delay] if i >= delay else 0.0
                 data.xfrc_applied[pushed, :3] = push[i]
                 mujoco.mj_step(model, data)
                 done = i + 1
@@ -332,6 +332,7 @@ def simulate(
     ticks_log = simulation.unpack_log(np.stack(logs))
     held = np.arange(done) // per_tick
     return Trajectory(
+        dt=config.sim.sim_dt,
         time=np.arange(done) * config.sim.sim_dt,
         qpos=qpos[keep],
         qvel=qvel[keep],

@@ -5,7 +5,8 @@ import numpy as np
 
 from kjax.config import SimConfig, TerrainConfig
 from kjax.robots import go1
-from kjax.sim.terrain import add_obstacles
+from kjax.sim.terrain import add_obstacles, generate, place
+from kjax.types import Leg
 
 _CONES = {
     "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
@@ -13,8 +14,17 @@ _CONES = {
 }
 
 
-def build_spec(config: SimConfig, terrain: TerrainConfig | None = None) -> mujoco.MjSpec:
-    """MjSpec of the Go1 on its ground, open to further edits before ``compile``."""
+def build_spec(
+    config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
+) -> mujoco.MjSpec:
+    """MjSpec of the Go1 on its ground, open to further edits before ``compile``.
+
+    Args:
+      config: physics.
+      terrain: obstacles; none if ``None``.
+      visual: whether to make it fit to look at; textures are 97 % of the compiled model, which a
+        batch holds once per robot.
+    """
     spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
     spec.option.timestep = config.sim_dt
     spec.option.cone = _CONES[config.cone]
@@ -30,15 +40,36 @@ def build_spec(config: SimConfig, terrain: TerrainConfig | None = None) -> mujoc
         elif config.contacts == "feet":
             geom.contype, geom.conaffinity = 0, 0
     _add_base(spec, config.base)
-    _add_world(spec)
+    _add_ground(spec, visual)
+    if visual:
+        _add_looks(spec)
     if terrain is not None:
         add_obstacles(spec, terrain, config.friction)
     return spec
 
 
-def build_model(config: SimConfig, terrain: TerrainConfig | None = None) -> mujoco.MjModel:
+def build_model(
+    config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
+) -> mujoco.MjModel:
     """Compiled model of the Go1 on its ground, flat by default."""
-    return build_spec(config, terrain).compile()
+    return build_spec(config, terrain, visual=visual).compile()
+
+
+def dress(model: mujoco.MjModel, config: SimConfig, field: TerrainConfig) -> None:
+    """Give a compiled scene another config's obstacles, friction and payload, in place.
+
+    Raises:
+      ValueError: for a field with another number of obstacles.
+    """
+    trunk = model.body("trunk").id
+    model.body_mass[trunk] = go1.PARAMS.trunk_mass + config.payload
+    model.geom_friction[foot_geoms(model), 0] = config.friction
+    place(model, generate(field, config.friction))  # and computes what follows from the mass
+
+
+def foot_geoms(model: mujoco.MjModel) -> list[int]:
+    """Geoms of the feet, leg order."""
+    return [model.geom(f"{leg.name}_foot").id for leg in Leg]
 
 
 def _add_base(spec: mujoco.MjSpec, base: str) -> None:
@@ -57,8 +88,21 @@ def _add_base(spec: mujoco.MjSpec, base: str) -> None:
         trunk.add_joint(name=name, type=kind, axis=axis, damping=[0, 0, 0], armature=0)
 
 
-def _add_world(spec: mujoco.MjSpec) -> None:
-    """Ground plane, light, sky and a camera that follows the robot from its right side."""
+def _add_ground(spec: mujoco.MjSpec, visual: bool) -> None:
+    """The plane that everything stands on."""
+    spec.worldbody.add_geom(
+        name="ground",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        contype=1,
+        conaffinity=0,
+        material="ground" if visual else "",
+        rgba=[1.0, 1.0, 1.0, 1.0],
+    )
+
+
+def _add_looks(spec: mujoco.MjSpec) -> None:
+    """Tiles, light, sky and a camera that follows the robot from its right side."""
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -79,16 +123,6 @@ def _add_world(spec: mujoco.MjSpec) -> None:
     )
     material = spec.add_material(name="ground", texrepeat=[4, 4], texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    world = spec.worldbody
-    world.add_geom(
-        name="ground",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 0.05],
-        contype=1,
-        conaffinity=0,
-        material="ground",
-        rgba=[1.0, 1.0, 1.0, 1.0],
-    )
     spec.body("trunk").add_light(
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -0.6, 3], dir=[0, 0.2, -1]
     )

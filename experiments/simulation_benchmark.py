@@ -1,0 +1,316 @@
+"""Closed loops per second of both engines beside the bare ones; for benchmark.py simulation."""
+
+import dataclasses
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib.pyplot as plt
+import mujoco.batch
+import numpy as np
+from mujoco import mjx
+
+from kjax.config import RunConfig, load_config
+from kjax.sim.batch_loop import BatchEngine, dressed
+from kjax.sim.episode import initial_state
+from kjax.sim.mjx_loop import MjxEngine
+from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.observe import resolve
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+BATCHES = (1, 16, 64, 256, 1024)
+MJX_BATCHES = (16, 128)
+ROUNDS = 5  # of closed loop and bare engine in turn; medians of each, and of their ratios
+WALK = 1.0  # s of walking that is timed in C
+WALK_MJX = 0.25
+
+
+def run(folder: Path, *, quick: bool) -> dict[str, Any]:
+    """All measurements; leaves figure.png and table.md in the folder."""
+    jax.config.update("jax_enable_x64", False)
+    batches = BATCHES[:3] if quick else BATCHES
+    rounds = 2 if quick else ROUNDS
+    result: dict[str, Any] = {"threads": len(_cores()), "c": {}, "mjx": {}}
+    for gait, torques in (("trot", "held"), ("trot", "every_step"), ("bound", "held")):
+        sizes = batches if gait == "trot" else batches[-1:]
+        for size in sizes:
+            entry = c_batch(gait, torques, size, rounds)
+            result["c"][f"{gait}, {torques}, {size}"] = entry
+            print(f"C, {gait}, {torques}, {size}: {entry['robot_steps_per_s']:.0f} robot-steps/s, "
+                  f"{entry['over_bare']:.3f} of the bare engine", flush=True)  # fmt: skip
+    result["python_loop"] = python_loop(0.5 if quick else 4.0)
+    for size in MJX_BATCHES[:1] if quick else MJX_BATCHES:
+        entry = mjx_batch(size, rounds)
+        result["mjx"][str(size)] = entry
+        print(f"MJX, trot, every_step, {size}: {entry['robot_steps_per_s']:.0f} robot-steps/s, "
+              f"{entry['over_bare']:.3f} of the bare one, compiled in {entry['compile_s']:.0f} s",
+              flush=True)  # fmt: skip
+    if not quick:
+        result |= mjx_compile_times()
+        result["two_process_speedup"] = two_processes(folder)
+    result |= headline(result)
+    (folder / "table.md").write_text(table(result), encoding="utf-8")
+    figure(result, folder / "figure.png")
+    return result
+
+
+def headline(result: dict[str, Any]) -> dict[str, float]:
+    """The ratios that are quoted."""
+    largest = max(int(key.split(", ")[-1]) for key in result["c"])
+    held, every, bound = (
+        result["c"][f"{name}, {largest}"]
+        for name in ("trot, held", "trot, every_step", "bound, held")
+    )
+    return {
+        "c_held_over_bare": held["over_bare"],
+        "c_every_step_over_bare": every["over_bare"],
+        "c_bound_held_over_bare": bound["over_bare"],
+        "c_batch_over_loop": held["robot_steps_per_s"] / result["python_loop"]["robot_steps_per_s"],
+        "mjx_closed_over_bare": list(result["mjx"].values())[-1]["over_bare"],
+    }
+
+
+def cases(gait: str, count: int, seconds: float) -> list[RunConfig]:
+    """Flat ground, constant speed, another seed for each robot."""
+    speed = {"trot": 0.3, "bound": 0.5}[gait]
+    name = {"trot": "trot_velocity", "bound": "bound_velocity"}[gait]
+    overrides = {
+        "sim.contacts": "feet",
+        "duration": seconds,
+        "command.times": [0.0],
+        "command.velocities": [speed],
+    }
+    config = load_config(RunConfig, CONFIGS / f"{name}.toml", overrides)
+    return [dataclasses.replace(config, seed=seed) for seed in range(count)]
+
+
+def c_batch(gait: str, torques: Any, size: int, rounds: int) -> dict[str, float]:
+    """Closed loop, and the bare engine on the torques of that loop, in turn."""
+    seconds = WALK if size >= 256 else 2.0 * WALK
+    configs = cases(gait, size, seconds)
+    engine = BatchEngine(configs[0], torques=torques)
+    recording = engine.run(configs)  # compiles
+    bare = bare_batch(engine, configs, recording.torque, torques)
+    steps = size * round(seconds / configs[0].sim.sim_dt)
+    closed_times, bare_times = [], []
+    for _ in range(rounds):
+        closed_times.append(engine.run(configs).wall_time)
+        bare_times.append(bare())
+    ratios = np.array(bare_times) / np.array(closed_times)
+    return {
+        "robot_steps_per_s": steps / float(np.median(closed_times)),
+        "bare_robot_steps_per_s": steps / float(np.median(bare_times)),
+        "over_bare": float(np.median(ratios)),
+        "over_bare_min": float(ratios.min()),
+        "over_bare_max": float(ratios.max()),
+        "falls": int(recording.fell.sum()),
+        "resident_MB": _resident(),
+    }
+
+
+def bare_batch(
+    engine: BatchEngine, configs: Sequence[RunConfig], torque: np.ndarray, torques: str
+) -> Callable[[], float]:
+    """MuJoCo's own batch with as many threads, fed recorded torques: time of a run [s]."""
+    model = dressed(engine.model, configs[:1])[0]
+    per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
+    batch = mujoco.batch.Batch(model, nsim=len(configs), nthread=engine.threads)
+    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+    order = np.argsort(resolve(model).actuator.reshape(-1))
+    starts = [initial_state(config, model.nq, model.nv) for config in configs]
+
+    def once() -> float:
+        batch.reset()
+        for i, (q, v) in enumerate(starts):
+            qpos[i], qvel[i] = q, v
+        batch.forward()
+        clock = time.perf_counter()
+        for row in torque:
+            ctrl[:] = row[:, order]
+            if torques == "held":
+                batch.step(nstep=per_tick)
+            else:
+                for _ in range(per_tick):
+                    batch.step(nstep=1)
+        return time.perf_counter() - clock
+
+    return once
+
+
+def python_loop(seconds: float) -> dict[str, float]:
+    """The obvious alternative: one robot after the other, torques at every step."""
+    config = cases("trot", 1, seconds)[0]
+    simulation = build_simulation(config)
+    simulate(simulation)
+    times = [simulate(simulation, seed=seed).wall_time for seed in range(3)]
+    return {
+        "robot_steps_per_s": round(seconds / config.sim.sim_dt) / float(np.median(times)),
+    }
+
+
+def mjx_batch(size: int, rounds: int) -> dict[str, float]:
+    """Closed loop on MJX, and ``mjx.step`` in a scan with torques held, in turn."""
+    configs = cases("trot", size, WALK_MJX)
+    engine = MjxEngine(configs[0])
+    clock = time.perf_counter()
+    recording = engine.run(configs)
+    first = time.perf_counter() - clock
+    model = mjx.put_model(engine.model)
+    steps = round(WALK_MJX / configs[0].sim.sim_dt)
+    per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
+    order = np.argsort(resolve(engine.model).actuator.reshape(-1))
+
+    def begin(qpos: Any, qvel: Any) -> Any:
+        data = mjx.make_data(model)
+        data = data.replace(qpos=data.qpos.at[:].set(qpos), qvel=data.qvel.at[:].set(qvel))
+        return mjx.forward(model, data)
+
+    def walk(data: Any, torque: Any) -> Any:
+        def tick(data: Any, row: Any) -> Any:
+            def step(data: Any, _: None) -> Any:
+                moved = mjx.step(model, data.replace(ctrl=row))
+                return jax.tree.map(lambda a, b: a.astype(b.dtype), moved, data), None
+
+            return jax.lax.scan(step, data, None, length=per_tick)[0], data.qpos
+
+        return jax.lax.scan(tick, data, torque)
+
+    starts = [initial_state(config, engine.model.nq, engine.model.nv) for config in configs]
+    qpos, qvel = (np.stack(a) for a in zip(*starts, strict=True))
+    data = jax.jit(jax.vmap(begin))(qpos, qvel)
+    bare = jax.jit(jax.vmap(walk, (0, 1)))
+    torque = recording.torque[: len(recording.qpos)][..., order]
+    jax.block_until_ready(bare(data, torque))
+    closed_times, bare_times = [], []
+    for _ in range(rounds):
+        closed_times.append(engine.run(configs).wall_time)
+        clock = time.perf_counter()
+        jax.block_until_ready(bare(data, torque))
+        bare_times.append(time.perf_counter() - clock)
+    ratios = np.array(bare_times) / np.array(closed_times)
+    return {
+        "robot_steps_per_s": size * steps / float(np.median(closed_times)),
+        "bare_robot_steps_per_s": size * steps / float(np.median(bare_times)),
+        "over_bare": float(np.median(ratios)),
+        "compile_s": first - float(np.median(closed_times)),
+        "traces": engine.traces,
+        "falls": int(recording.fell.sum()),
+        "resident_MB": _resident(),
+    }
+
+
+def mjx_compile_times() -> dict[str, float]:
+    """First call of a closed loop of 16 robots with an empty compile cache, and with a full one."""
+    code = (
+        "import sys, time; sys.path.insert(0, sys.argv[1])\n"
+        "from kjax import cli; cli.configure_jax()\n"
+        "import jax; jax.config.update('jax_enable_x64', False)\n"
+        "import simulation_benchmark as b\n"
+        "from kjax.sim.mjx_loop import MjxEngine\n"
+        "configs = b.cases('trot', 16, 0.05); engine = MjxEngine(configs[0])\n"
+        "clock = time.perf_counter(); r = engine.run(configs)\n"
+        "print(time.perf_counter() - clock)\n"
+    )
+    times = []
+    with tempfile.TemporaryDirectory() as cache:
+        for _ in range(2):
+            done = subprocess.run(
+                [sys.executable, "-c", code, str(Path(__file__).parent)],
+                env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache},
+                capture_output=True, text=True, check=True,
+            )  # fmt: skip
+            times.append(float(done.stdout.splitlines()[-1]))
+    return {"mjx_compile_s_cold": times[0], "mjx_compile_s_cached": times[1]}
+
+
+def two_processes(folder: Path) -> float:
+    """Speed of a sweep on two processes of one thread over that on one, both compiled before."""
+    sweep = CONFIGS / "sweeps" / "benchmark.toml"
+    script = Path(__file__).with_name("sweep.py")
+
+    def once(count: int) -> float:
+        out = folder / f"processes_{count}"
+        common = [sys.executable, str(script), str(sweep), "--threads", "1", "--restart"]
+        clock = time.perf_counter()
+        running = []
+        for number in range(count):
+            more = [] if count == 1 else [
+                "--coordinator", "127.0.0.1:12355", "--processes", str(count),
+                "--process", str(number),
+            ]  # fmt: skip
+            pin = ["taskset", "-c", str(_cores()[number % len(_cores())])]
+            running.append(
+                subprocess.Popen(
+                    [*pin, *common, *more, "--out", str(out)],
+                    stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                )
+            )  # fmt: skip
+        texts = [process.communicate()[0] for process in running]
+        if any(process.returncode for process in running):
+            raise RuntimeError("\n".join(texts))
+        return time.perf_counter() - clock
+
+    once(1)
+    alone, together = once(1), once(2)
+    return alone / together
+
+
+def _cores() -> list[int]:
+    return sorted(os.sched_getaffinity(0))
+
+
+def _resident() -> float:
+    """Largest resident memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+# ---------------------------------------------------------------- presentation
+
+
+def table(result: dict[str, Any]) -> str:
+    """All of it as Markdown."""
+    lines = ["| engine, gait, torques, robots | robot-steps/s | bare engine | part of it |",
+             "|---|---|---|---|"]  # fmt: skip
+    rows = [(f"C, {name}", entry) for name, entry in result["c"].items()]
+    rows += [(f"MJX, trot, every_step, {name}", entry) for name, entry in result["mjx"].items()]
+    for name, entry in rows:
+        lines.append(
+            f"| {name} | {entry['robot_steps_per_s']:,.0f} | "
+            f"{entry['bare_robot_steps_per_s']:,.0f} | {entry['over_bare']:.2f} |"
+        )
+    alone = result["python_loop"]["robot_steps_per_s"]
+    lines.append(f"| C, trot, every step, one robot in a Python loop | {alone:,.0f} | | |")
+    return "\n".join(lines) + "\n"
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Robot-steps per second against the number of robots."""
+    fig, ax = plt.subplots(figsize=(6, 4), layout="constrained")
+    for torques, color in (("held", "C0"), ("every_step", "C1")):
+        points = {
+            int(key.split(", ")[-1]): entry
+            for key, entry in result["c"].items()
+            if key.startswith(f"trot, {torques}")
+        }
+        for kind, style in (("robot_steps_per_s", "o-"), ("bare_robot_steps_per_s", ":")):
+            label = f"C, torques {torques.replace('_', ' ')}" + (", bare" if style == ":" else "")
+            ax.loglog(list(points), [e[kind] for e in points.values()], style, color=color,
+                      label=label)  # fmt: skip
+    points = {int(key): entry for key, entry in result["mjx"].items()}
+    for kind, style in (("robot_steps_per_s", "o-"), ("bare_robot_steps_per_s", ":")):
+        label = "MJX, every step" + (", bare" if style == ":" else "")
+        ax.loglog(list(points), [e[kind] for e in points.values()], style, color="C2", label=label)
+    alone = result["python_loop"]["robot_steps_per_s"]
+    ax.axhline(alone, color="0.5", lw=1, label="one robot in a Python loop")
+    ax.set(xlabel="robots", ylabel="robot-steps per second",
+           title=f"Flat trot, {result['threads']} threads")  # fmt: skip
+    ax.legend(fontsize=7)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)

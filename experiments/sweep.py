@@ -1,0 +1,112 @@
+"""Walk a whole sweep of closed loops: a grid or a random sample of configs, times seeds.
+
+Leaves sweep.nc (labelled, xarray), manifest.json, figure.png and one file per chunk in the output
+folder. Run again, it goes on where it stopped; finished, it only draws.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from kjax import cli
+from kjax.config import ConfigError, SweepConfig, load_config
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = cli.script_parser(__doc__.splitlines()[0])
+    parser.add_argument("config", help="TOML file of a sweep, e.g. configs/sweeps/trot_rough.toml")
+    parser.add_argument("--engine", choices=("c", "mjx"), help="instead of the file's")
+    parser.add_argument("--torques", choices=("every_step", "held"), help="instead of the file's")
+    parser.add_argument("--seeds", type=int, help="episodes per point, instead of the file's")
+    parser.add_argument("--chunk", type=int, help="robots at once, instead of the file's")
+    parser.add_argument("--threads", type=int, help="of the C engine (default: one per core)")
+    parser.add_argument("--restart", action="store_true", help="drop what the folder holds")
+    parser.add_argument("--distributed", action="store_true",
+                        help="one of several processes, as Slurm or Open MPI tell")  # fmt: skip
+    parser.add_argument("--coordinator", metavar="HOST:PORT",
+                        help="the same by hand: address of process 0")  # fmt: skip
+    parser.add_argument("--processes", type=int, help="their number")
+    parser.add_argument("--process", type=int, help="number of this one, from 0 on")
+    args = parser.parse_args()
+    for name in ("seeds", "chunk", "threads"):
+        if getattr(args, name) is not None and getattr(args, name) < 1:
+            cli.fail(f"--{name}: got {getattr(args, name)}, wanted at least 1")
+    given = {name: getattr(args, name) for name in ("engine", "torques", "seeds", "chunk")}
+    try:
+        sweep = load_config(
+            SweepConfig, args.config, {k: v for k, v in given.items() if v is not None}
+        )
+    except ConfigError as error:
+        cli.fail(str(error))
+    cli.configure_jax()
+    jax.config.update("jax_enable_x64", sweep.precision == "float64")
+    barrier = start_processes(args)
+    process, processes = jax.process_index(), jax.process_count()
+    folder = args.out or Path("results") / Path(args.config).stem
+
+    from kjax.sweep.runner import run_sweep
+    from kjax.sweep.store import StoreError
+
+    clock = time.perf_counter()
+    try:
+        dataset = run_sweep(
+            sweep,
+            Path(args.config),
+            folder,
+            threads=args.threads,
+            process=process,
+            processes=processes,
+            barrier=barrier,
+            fresh=args.restart,
+        )
+    except (ConfigError, StoreError) as error:
+        cli.fail(str(error))
+    except KeyboardInterrupt:
+        print(f"stopped; finished chunks are kept in {folder}/, run again to go on")
+        raise SystemExit(130) from None
+    if dataset is None:
+        return
+    try:
+        report(dataset, sweep, folder)
+    except ValueError as error:
+        cli.fail(f"{args.config}: {error}")
+    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+
+
+def start_processes(args: Any) -> Any:
+    """Join the other processes, if there are any; a barrier for them, or ``None``."""
+    by_hand = [args.coordinator, args.processes, args.process]
+    if not args.distributed and all(value is None for value in by_hand):
+        return None
+    if not args.distributed and any(value is None for value in by_hand):
+        cli.fail("--coordinator, --processes and --process: wanted all three, or --distributed")
+    try:
+        if args.distributed:
+            jax.distributed.initialize()
+        else:
+            jax.distributed.initialize(args.coordinator, args.processes, args.process)
+    except (RuntimeError, ValueError) as error:
+        cli.fail(f"jax.distributed: {str(error).splitlines()[0]}")
+    from jax.experimental import multihost_utils
+
+    return multihost_utils.sync_global_devices
+
+
+def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
+    """Draw the figure and print what came out, in one line."""
+    from kjax.viz.sweep_plots import success, sweep_figure
+
+    sweep_figure(dataset, sweep, folder / "figure.png")
+    good = success(dataset)
+    print(
+        f"{good.size} episodes, {int(good.sum())} succeeded, "
+        f"{int(dataset['fell'].sum())} fell; median RMSE "
+        f"{float(dataset['velocity_rmse_mps'].where(dataset['fell'] == 0).median()):.4f} m/s"
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main)

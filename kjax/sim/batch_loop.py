@@ -1,0 +1,384 @@
+"""Many robots in C MuJoCo: MuJoCo's batches, and one jitted controller call for all robots a tick.
+
+The robots are split into as many groups as there are threads. Each group has a batch of its own
+and a Python thread that takes turns between controller and physics; both release the interpreter,
+so that no core waits for another.
+
+Every robot has its own ``MjModel``, so terrain, friction and payload may differ, and its physics is
+that of a single run to the last bit.
+"""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from copy import copy
+from threading import Event
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.batch
+import numpy as np
+
+from kjax.config import RunConfig
+from kjax.params import ControllerParams
+from kjax.sim.cases import BatchPart, Case, batch_part, push_at, stack_cases, stack_params
+from kjax.sim.episode import initial_state
+from kjax.sim.observe import resolve
+from kjax.sim.push import pushed_body
+from kjax.sim.recording import Recording, empty_log
+from kjax.sim.scene import build_model, dress
+from kjax.sim.walk import Sensed, TickLog, WalkState, build_walk
+
+Torques = Literal["every_step", "held"]
+# Called from time to time with the robot-ticks done and the robot-ticks in all.
+OnProgress = Callable[[int, int], None]
+
+_WAIT = 0.1  # s between two looks at the threads
+
+
+class Calls(NamedTuple):
+    """Jitted functions of a group, batched over its robots.
+
+    Attributes:
+      init: (params, case, sensed) -> state.
+      first: (params, case, state, step, sensed) -> (state, torque, log); plan and act.
+      then: the same without plan -> (state, torque).
+    """
+
+    init: Callable[..., WalkState]
+    first: Callable[..., tuple[WalkState, Any, TickLog]]
+    then: Callable[..., tuple[WalkState, Any]]
+
+
+class BatchEngine:
+    """C MuJoCo for batches of configs with one ``cases.batch_part``.
+
+    Compiles once per number of robots and kind of difference between them.
+
+    Attributes:
+      part: what all configs have in common.
+      model: MuJoCo model of the scene.
+      torques: ``"every_step"``: at every physics step, as on the robot; ``"held"``: at the control
+        rate, held in between, several times cheaper.
+      threads: number of groups.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        *,
+        torques: Torques = "every_step",
+        threads: int | None = None,
+        dtype: Any = np.float32,
+    ):
+        """Scene and controller functions; nothing is compiled yet.
+
+        Args:
+          config: one of those to come.
+          torques: see the class.
+          threads: as many as this process may use cores if ``None``.
+          dtype: floating type of the controller.
+        """
+        if torques not in ("every_step", "held"):
+            raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads must be at least 1, got {threads}")
+        self.part, self.torques, self.dtype = batch_part(config), torques, np.dtype(dtype)
+        self.threads = _cores() if threads is None else threads
+        self.model = build_model(config.sim, config.terrain, visual=False)
+        self._walk = build_walk(
+            config, self.model, resolve(self.model).actuator, held=torques == "held"
+        )
+        self._calls: dict[Any, Calls] = {}
+
+    def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
+        """Closed loops of all configs, each until its end or its fall.
+
+        On Ctrl-C what was walked is returned, marked as interrupted.
+
+        Raises:
+          ValueError: for a config with another ``batch_part``, or other durations.
+        """
+        require_one_batch(self.part, configs, self.torques)
+        threads = min(self.threads, len(configs))
+        size = -(-len(configs) // threads)
+        filled = [*configs, *[configs[-1]] * (threads * size - len(configs))]
+        params, axes = stack_params(filled, self.dtype)
+        case = stack_cases(filled)
+        calls = self._compiled(axes)
+        stop, groups = Event(), []
+        for first in range(0, len(filled), size):
+            own = slice(first, first + size)
+            groups.append(
+                _Group(
+                    self.model,
+                    filled[own],
+                    calls,
+                    self.torques,
+                    self.dtype,
+                    stop,
+                    params=_rows(params, axes, own),
+                    case=jax.tree.map(lambda a, s=own: a[s], case),
+                )
+            )
+        groups[0].warm_up()  # compile in one thread
+        begin = time.perf_counter()
+        interrupted = _run_threads(groups, stop, on_progress)
+        wall = time.perf_counter() - begin
+        done = [group.result() for group in groups]
+        parts = [
+            np.concatenate(arrays, axis=-1) for arrays in zip(*(d[:2] for d in done), strict=True)
+        ]
+        series = [
+            np.concatenate(arrays, axis=1)[:, : len(configs)]
+            for arrays in zip(*(d[2:] for d in done), strict=True)
+        ]
+        return Recording(
+            configs=list(configs),
+            dt=self.part.config.lmpc.control_dt,
+            ticks=parts[0][: len(configs)],
+            fell=parts[1][: len(configs)],
+            qpos=series[0],
+            qvel=series[1],
+            torque=series[2],
+            log=TickLog(*series[3:]),
+            wall_time=wall,
+            interrupted=interrupted,
+        )
+
+    def _compiled(self, axes: Any) -> Calls:
+        """Batched and jitted functions for parameters with these axes."""
+        leaves, tree = jax.tree.flatten(axes, is_leaf=lambda a: a is None)
+        key = (tuple(leaves), tree)
+        if key not in self._calls:
+            walk = self._walk
+
+            def both(params: Any, case: Any, state: Any, step: Any, sensed: Any) -> Any:
+                state, log = walk.plan(params, case, state, step, sensed)
+                state, torque = walk.act(params, case, state, step, sensed)
+                return state, torque, log
+
+            self._calls[key] = Calls(
+                init=jax.jit(jax.vmap(walk.init, (axes, 0, 0))),
+                # The old state is given up, so that what stays the same is not copied.
+                first=jax.jit(jax.vmap(both, (axes, 0, 0, None, 0)), donate_argnums=2),
+                then=jax.jit(jax.vmap(walk.act, (axes, 0, 0, None, 0)), donate_argnums=2),
+            )
+        return self._calls[key]
+
+
+class _Group:
+    """The robots of one thread."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        configs: Sequence[RunConfig],
+        calls: Calls,
+        torques: Torques,
+        dtype: np.dtype,
+        stop: Event,
+        *,
+        params: ControllerParams,
+        case: Case,
+    ):
+        config, count = configs[0], len(configs)
+        self._calls, self._stop, self._dtype = calls, stop, dtype
+        self._params, self._case = params, case
+        self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+        self._held = torques == "held"
+        self.ticks = ticks_of(config)
+        self.done = 0
+        models = dressed(model, configs)
+        self._batch = mujoco.batch.Batch(models[0], nsim=count, nthread=1)
+        if any(one is not models[0] for one in models):
+            self._batch.set_models(models)
+        bind = self._batch.bind
+        self._qpos, self._qvel = bind("qpos"), bind("qvel")
+        self._sensordata, self._ctrl = bind("sensordata"), bind("ctrl")
+        self._pushes = bind("xfrc_applied")[:, pushed_body(model), :3]
+        for i, one in enumerate(configs):
+            self._qpos[i], self._qvel[i] = initial_state(one, model.nq, model.nv)
+        self._batch.forward()
+        self._legs = resolve(model).actuator.reshape(-1)
+        self._pushed = bool((case.push_steps > 0).any())
+        unit = self._per_tick if self._held else 1
+        # Torques on their way to the joints, a ring of as many as the longest delay.
+        self._ring = np.zeros((1 + int(case.delay.max()) // unit, count, model.nu))
+        self._delay = case.delay // unit
+        self.fell_at = np.full(count, self.ticks)
+        self.fell = np.zeros(count, bool)
+        self._state: Any = None
+        self._record: list[Any] = []
+
+    def sensed(self) -> Sensed:
+        """What the controller sees, in its type."""
+        return Sensed(
+            *(
+                np.asarray(field, self._dtype)
+                for field in (self._qpos, self._qvel, self._sensordata)
+            )
+        )
+
+    def warm_up(self) -> None:
+        """Compile by calling, results dropped."""
+        sensed, step = self.sensed(), np.int32(0)
+        state = self._calls.init(self._params, self._case, sensed)
+        state, *rest = self._calls.first(self._params, self._case, state, step, sensed)
+        if not self._held:
+            state, *rest = self._calls.then(self._params, self._case, state, step, sensed)
+        jax.block_until_ready((state, rest))
+
+    def walk(self) -> None:
+        """All ticks, until told to stop."""
+        params, case = self._params, self._case
+        state = self._calls.init(params, case, self.sensed())
+        alive = np.ones(len(self.fell), bool)
+        ids: np.ndarray | None = None  # all
+        series: tuple[np.ndarray, ...] = ()
+        for tick in range(self.ticks):
+            if self._stop.is_set() or not alive.any():
+                break
+            step, sensed = tick * self._per_tick, self.sensed()
+            state, torque, log = self._calls.first(params, case, state, np.int32(step), sensed)
+            host = TickLog(*map(np.asarray, log))
+            torque = np.asarray(torque)
+            if not series:
+                series = self._arrays(host)
+            for array, value in zip(
+                series, (self._qpos, self._qvel, torque[:, self._legs], *host), strict=True
+            ):
+                array[tick] = value
+            still = np.asarray(state.alive)
+            if not still[alive].all():
+                fallen = alive & ~still
+                self.fell_at[fallen], self.fell[fallen] = tick + 1, True
+                alive = alive & still
+                ids = np.flatnonzero(alive)
+                if not len(ids):
+                    break
+            for i in range(1 if self._held else self._per_tick):
+                if i > 0:
+                    state, torque = self._calls.then(
+                        params, case, state, np.int32(step + i), self.sensed()
+                    )
+                    torque = np.asarray(torque)
+                self._apply(torque, step + i)
+                self._advance(ids, alive)
+            self.done = tick + 1
+        self._record = list(series)
+
+    def _apply(self, torque: np.ndarray, step: int) -> None:
+        """Torques, delayed, and pushes for the physics steps from ``step`` on."""
+        count = self._per_tick if self._held else 1
+        if len(self._ring) > 1:
+            place = step // count
+            self._ring[place % len(self._ring)] = torque
+            when = (place - self._delay) % len(self._ring)
+            torque = self._ring[when, np.arange(len(torque))]
+        self._ctrl[:] = torque
+        if self._pushed:
+            self._pushes[:] = push_at(self._case, step, count)
+
+    def _advance(self, ids: np.ndarray | None, alive: np.ndarray) -> None:
+        """Physics of the robots that are alive."""
+        try:
+            self._batch.step(ids=ids, nstep=self._per_tick if self._held else 1)
+        except mujoco.batch.SimulationError as error:
+            # They kept their state: make it one that counts as a fall in the next tick.
+            self._qpos[np.asarray(error.ids)] = np.nan
+
+    def _arrays(self, log: TickLog) -> tuple[np.ndarray, ...]:
+        count = len(self.fell)
+        qpos, qvel = (np.zeros((self.ticks, *field.shape)) for field in (self._qpos, self._qvel))
+        torque = np.zeros((self.ticks, count, len(self._legs)), self._dtype)
+        return qpos, qvel, torque, *empty_log(self.ticks, log)
+
+    def result(self) -> tuple[np.ndarray, ...]:
+        """Ticks done, falls, and the series."""
+        did = np.minimum(self.fell_at, self.done) if self._stop.is_set() else self.fell_at
+        return (np.where(self.fell, self.fell_at, did), self.fell, *self._record)
+
+
+def _run_threads(groups: list[_Group], stop: Event, on_progress: OnProgress | None) -> bool:
+    """Run all groups to their end; whether Ctrl-C stopped them."""
+    robots = [len(group.fell) for group in groups]
+    total = sum(group.ticks * count for group, count in zip(groups, robots, strict=True))
+    interrupted = False
+    with ThreadPoolExecutor(len(groups)) as pool:
+        futures = [pool.submit(group.walk) for group in groups]
+        while True:
+            try:
+                _, left = wait(futures, timeout=_WAIT)
+                if on_progress is not None:
+                    done = (group.done * n for group, n in zip(groups, robots, strict=True))
+                    on_progress(sum(done) if left else total, total)
+                if not left:
+                    break
+            except KeyboardInterrupt:
+                interrupted = True
+                stop.set()
+    for future in futures:
+        future.result()
+    return interrupted
+
+
+def ticks_of(config: RunConfig) -> int:
+    """Control ticks of an episode."""
+    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    return -(-round(config.duration / config.sim.sim_dt) // per_tick)
+
+
+def dressed(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.MjModel]:
+    """A copy of the scene for each config's obstacles, friction and payload; equal ones shared."""
+    made: dict[Any, mujoco.MjModel] = {}
+    out = []
+    for config in configs:
+        key = (config.terrain, config.sim.friction, config.sim.payload)
+        if key not in made:
+            made[key] = copy(model)
+            dress(made[key], config.sim, config.terrain)
+        out.append(made[key])
+    return out
+
+
+def require_one_batch(part: BatchPart, configs: Sequence[RunConfig], torques: str) -> None:
+    """Raise a ValueError that says which config does not fit into a batch."""
+    if not configs:
+        raise ValueError("configs must hold at least one config, got none")
+    for i, config in enumerate(configs):
+        if batch_part(config) != part:
+            raise ValueError(f"configs[{i}] belongs to another batch (see cases.batch_part)")
+        if config.duration != configs[0].duration:
+            raise ValueError(
+                f"configs[{i}].duration is {config.duration} s, the first one's "
+                f"{configs[0].duration} s; one batch has one duration"
+            )
+        tick = config.lmpc.control_dt
+        if (
+            torques == "held"
+            and abs(config.sim.delay / tick - round(config.sim.delay / tick)) > 1e-6
+        ):
+            raise ValueError(
+                f"with held torques sim.delay must be a multiple of lmpc.control_dt {tick} s, got "
+                f"{config.sim.delay} s"
+            )
+
+
+def _rows(params: ControllerParams, axes: Any, rows: slice) -> ControllerParams:
+    """Parameters of some robots of a batch."""
+    return jax.tree.map(
+        lambda axis, leaf: leaf if axis is None else jnp.asarray(leaf[rows]),
+        axes,
+        params,
+        is_leaf=lambda a: a is None,
+    )
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,162 @@
+"""One robot of a batch as pure functions of an engine's arrays: sense, plan, act, record.
+
+Both engines vmap these: the C loop calls them once per control tick or physics step, the MJX loop
+holds them in its scans.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from kjax.config import RunConfig
+from kjax.controller import ControllerState, build_controller
+from kjax.legs.base import build_base
+from kjax.params import ControllerParams
+from kjax.sim.cases import Case
+from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
+from kjax.sim.observe import add_noise, build_observe
+from kjax.types import Observation
+
+
+class Sensed(NamedTuple):
+    """What an engine gives of one robot.
+
+    Attributes:
+      qpos: (nq,) positions.
+      qvel: (nv,) velocities.
+      sensordata: (ns,) sensors.
+    """
+
+    qpos: Float[Array | np.ndarray, "nq"]
+    qvel: Float[Array | np.ndarray, "nv"]
+    sensordata: Float[Array | np.ndarray, "ns"]
+
+
+class WalkState(NamedTuple):
+    """What one robot carries besides its physics.
+
+    Attributes:
+      controller: state of the controller.
+      track: true heading at the start, ``None`` on the planar base.
+      alive: whether it has neither fallen nor left the finite numbers.
+    """
+
+    controller: ControllerState
+    track: Any
+    alive: Bool[Array, ""]
+
+
+class TickLog(NamedTuple):
+    """What is recorded of one control tick, at its beginning; names as in ``Trajectory``."""
+
+    x: Any
+    feet: Any
+    foot_force: Any
+    gait: Any
+    stance: Any
+    force: Any
+    velocity_command: Any
+    velocity_reference: Any
+    status: Any
+    residual: Any
+    iterations: Any
+
+
+class Walk(NamedTuple):
+    """Functions of one robot.
+
+    Attributes:
+      init: (params, case, sensed) -> state.
+      plan: (params, case, state, step, sensed) -> (state, log); at the control rate.
+      act: (params, case, state, step, sensed) -> (state, torque (12,) in actuator order).
+    """
+
+    init: Callable[[ControllerParams, Case, Sensed], WalkState]
+    plan: Callable[[ControllerParams, Case, WalkState, Array, Sensed], tuple[WalkState, TickLog]]
+    act: Callable[[ControllerParams, Case, WalkState, Array, Sensed], tuple[WalkState, Array]]
+
+
+def build_walk(
+    config: RunConfig, model: mujoco.MjModel, actuators: np.ndarray, *, held: bool
+) -> Walk:
+    """Functions for all configs with one ``batch_part``.
+
+    Args:
+      config: any of them.
+      model: of the scene; its addresses count.
+      actuators: (4, 3) actuator of each joint, a permutation of all.
+      held: whether ``act`` is called once per control tick rather than at each physics step.
+    """
+    # The swing legs move on by one of these times with each call of ``act``.
+    act_dt = config.lmpc.control_dt if held else config.sim.sim_dt
+    controller = build_controller(replace(config, sim=replace(config.sim, sim_dt=act_dt)))
+    base = build_base(config.sim.base)
+    observe = build_observe(model, config.sim.contact_threshold)
+    touch = [model.sensor_adr[model.sensor(f"{leg}_foot").id] for leg in ("FR", "FL", "RR", "RL")]
+    order = np.argsort(actuators.reshape(-1))
+
+    def see(sensed: Sensed) -> Observation:
+        return observe(
+            jnp.asarray(sensed.qpos), jnp.asarray(sensed.qvel), jnp.asarray(sensed.sensordata)
+        )
+
+    def sense(case: Case, step: Array, sensed: Sensed) -> Observation:
+        if not config.noise.enabled:
+            return see(sensed)
+        row = noise_row(case.seed, step, config.sim.base).astype(sensed.qpos.dtype)
+        seen = add_noise(see(sensed), row * case.noise_scale.astype(row.dtype))
+        # Else XLA draws the numbers again for each of their uses.
+        return jax.lax.optimization_barrier(seen)
+
+    def init(params: ControllerParams, case: Case, sensed: Sensed) -> WalkState:
+        first = sense(case, jnp.zeros((), jnp.int32), sensed)
+        return WalkState(
+            controller=controller.init(params, first),
+            track=base.track(see(sensed)),
+            alive=jnp.ones((), bool),
+        )
+
+    def plan(
+        params: ControllerParams, case: Case, state: WalkState, step: Array, sensed: Sensed
+    ) -> tuple[WalkState, TickLog]:
+        moved, info = controller.plan(params, state.controller, sense(case, step, sensed))
+        true = see(sensed)
+        body = base.view(params.robot, state.track, true).planar
+        log = TickLog(
+            x=body.x,
+            feet=body.feet,
+            foot_force=sensed.sensordata[jnp.asarray(touch)],
+            gait=moved.clock.gait,
+            stance=moved.stance,
+            force=moved.force,
+            velocity_command=moved.velocity_command,
+            velocity_reference=moved.velocity,
+            status=info.status,
+            residual=info.residual,
+            iterations=info.iterations,
+        )
+        return WalkState(moved, state.track, state.alive & standing(body.x, true)), log
+
+    def act(
+        params: ControllerParams, case: Case, state: WalkState, step: Array, sensed: Sensed
+    ) -> tuple[WalkState, Array]:
+        moved, torque = controller.act(params, state.controller, sense(case, step, sensed))
+        torque = jnp.where(state.alive, torque, 0.0)
+        return state._replace(controller=moved), torque.reshape(-1)[order]
+
+    return Walk(init=init, plan=plan, act=act)
+
+
+def standing(x: Float[Array, "6"], observation: Observation) -> Bool[Array, ""]:
+    """Whether the robot has not fallen; not a number is a fall (``episode.fallen``)."""
+    w, i, j, k = observation.base_quat
+    roll = jnp.arctan2(2.0 * (w * i + j * k), 1.0 - 2.0 * (i * i + j * j))
+    finite = jnp.isfinite(observation.joint_pos).all() & jnp.isfinite(observation.joint_vel).all()
+    upright = (jnp.abs(x[2]) < FALL_TILT) & (jnp.abs(roll) < FALL_TILT)
+    return finite & (x[1] > FALL_HEIGHT) & upright

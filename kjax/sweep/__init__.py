@@ -1,0 +1,1 @@
+"""Sweeps: thousands of closed loops from one file, on disk as they end, resumable."""

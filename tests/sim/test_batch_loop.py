@@ -1,0 +1,152 @@
+"""Batches in C MuJoCo against single runs: the same physics to the last bit, the same loop."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from kjax.config import RunConfig, load_config
+from kjax.sim.batch_loop import BatchEngine, dressed
+from kjax.sim.episode import fixed_part, initial_state, metrics
+from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.observe import resolve
+
+pytestmark = pytest.mark.slow
+
+COMMON = {
+    "duration": 0.6,
+    "sim.contacts": "feet",
+    "terrain.kind": "paper",
+    "terrain.count": 3,
+    "terrain.start": 0.15,
+    "terrain.end": 0.4,
+    "lmpc.height_above": "feet",
+}
+OWN = (
+    {},
+    {"command.velocities": [0.3, 0.3, 0.3, 0.3, 0.3], "terrain.seed": 3},
+    {"push.times": [0.1], "push.forward": 4.0, "sim.friction": 0.6, "terrain.height_max": 0.09},
+    {"sim.payload": 2.0, "sim.delay": 0.005, "lmpc.height": 0.25},
+    {"noise.position": 0.0, "seed": 7},
+)
+
+
+@pytest.fixture(scope="module")
+def configs():
+    return [
+        dataclasses.replace(load_config(RunConfig, None, COMMON | own), seed=i)
+        for i, own in enumerate(OWN)
+    ]
+
+
+@pytest.fixture(scope="module")
+def engine(configs):
+    return BatchEngine(configs[0], dtype=np.float64, threads=2)
+
+
+@pytest.fixture(scope="module")
+def held(configs):
+    return BatchEngine(configs[0], torques="held", threads=2)
+
+
+@pytest.fixture(scope="module")
+def recording(engine, configs):
+    return engine.run(configs)
+
+
+@pytest.fixture(scope="module")
+def held_recording(held, configs):
+    return held.run(configs)
+
+
+def test_physics_is_that_of_single_robots_to_the_last_bit(held, held_recording, configs):
+    """Held torques are recorded whole, so a plain loop over ``mj_step`` can repeat them."""
+    actuators = resolve(held.model).actuator.reshape(-1)
+    for i, config in enumerate(configs):
+        (model,) = dressed(held.model, [config])
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+        mujoco.mj_forward(model, data)
+        trunk = model.body("trunk").id
+        delay = round(config.sim.delay / 0.005)
+        for tick in range(int(held_recording.ticks[i])):
+            np.testing.assert_array_equal(data.qpos, held_recording.qpos[tick, i])
+            np.testing.assert_array_equal(data.qvel, held_recording.qvel[tick, i])
+            torque = held_recording.torque[tick - delay, i] if tick >= delay else 0.0
+            data.ctrl[actuators] = torque
+            pushed = any(t <= tick * 0.005 + 1e-9 < t + 0.1 for t in config.push.times)
+            data.xfrc_applied[trunk, 0] = 40.0 if pushed else 0.0  # 4 N s in 0.1 s
+            mujoco.mj_step(model, data, 5)
+
+
+def test_closed_loops_are_those_of_single_runs(recording, configs):
+    simulations = {}
+    for i, config in enumerate(configs):
+        fixed = fixed_part(config)
+        if fixed not in simulations:
+            simulations[fixed] = build_simulation(config)
+        alone = simulate(simulations[fixed], config)
+        assert not alone.fell
+        # 1e-6: equal algorithms; a batch sums in another order, and contacts amplify that.
+        np.testing.assert_allclose(recording.qpos[:, i], alone.qpos[::5], atol=1e-6)
+        own = recording.trajectory(i)
+        np.testing.assert_allclose(own.x, alone.x[::5], atol=1e-6)
+        np.testing.assert_allclose(own.torque, alone.torque[::5], atol=1e-3)
+        np.testing.assert_array_equal(own.stance, alone.stance[::5])
+        np.testing.assert_allclose(own.velocity_reference, alone.velocity_reference[::5])
+        few, many = metrics(own, config), metrics(alone, config)
+        error = (alone.x[:, 3] - alone.velocity_command)[500::5]  # from 0.5 s on, at the ticks
+        assert few["velocity_rmse_mps"] == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-6)
+        assert few["distance_m"] == pytest.approx(many["distance_m"], abs=5e-3)
+        assert set(many) - set(few) == {
+            "plan_ms_median", "plan_ms_p99", "act_ms_median", "act_ms_p99", "realtime_factor"
+        }  # fmt: skip
+
+
+def test_held_torques_walk_like_those_of_every_step(recording, held_recording):
+    assert not held_recording.fell.any()
+    for i in range(len(OWN)):
+        # the same place within a centimetre after 0.6 s
+        assert abs(recording.log.x[-1, i, 0] - held_recording.log.x[-1, i, 0]) < 0.01
+
+
+def test_a_robot_that_falls_leaves_its_neighbours_as_they_are(held, held_recording, configs):
+    thrown = dataclasses.replace(
+        configs[2], push=dataclasses.replace(configs[2].push, forward=80.0)
+    )
+    other = held.run([*configs[:2], thrown, *configs[3:]])
+    assert other.fell.tolist() == [False, False, True, False, False]
+    assert 20 < other.ticks[2] < 120
+    assert len(other.trajectory(2).time) == other.ticks[2]
+    for i in (0, 1, 3, 4):
+        np.testing.assert_array_equal(other.qpos[:, i], held_recording.qpos[:, i])
+
+
+def test_numbers_that_are_none_end_one_robot_only(held, held_recording, configs, monkeypatch):
+    """A state that is not a number, from the first tick on, is a fall."""
+    from kjax.sim import batch_loop
+
+    def start(config, nq, nv):
+        qpos, qvel = initial_state(config, nq, nv)
+        return (qpos * np.nan if config.seed == 1 else qpos), qvel
+
+    monkeypatch.setattr(batch_loop, "initial_state", start)
+    other = held.run(configs)
+    assert other.fell.tolist() == [False, True, False, False, False]
+    assert other.ticks[1] == 1
+    np.testing.assert_array_equal(other.qpos[:, 4], held_recording.qpos[:, 4])
+
+
+def test_it_says_which_config_does_not_fit(engine, held, configs):
+    with pytest.raises(ValueError, match=r"configs\[1\] belongs to another batch"):
+        engine.run([configs[0], load_config(RunConfig, None, COMMON | {"lmpc.horizon": 7})])
+    with pytest.raises(ValueError, match=r"configs\[1\]\.duration is 1\.0 s"):
+        engine.run([configs[0], dataclasses.replace(configs[0], duration=1.0)])
+    late = dataclasses.replace(configs[0], sim=dataclasses.replace(configs[0].sim, delay=0.003))
+    with pytest.raises(ValueError, match=r"sim\.delay must be a multiple of lmpc\.control_dt"):
+        held.run([late])
+    with pytest.raises(ValueError, match="at least one config"):
+        engine.run([])
+    with pytest.raises(ValueError, match="torques must be"):
+        BatchEngine(configs[0], torques="often")
