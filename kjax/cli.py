@@ -187,6 +187,9 @@ def configure_jax(*, one_core: bool = False, core: int | None = None) -> None:
         cores = sorted(os.sched_getaffinity(0))
         number = os.getpid() if core is None else core
         os.sched_setaffinity(0, {cores[number % len(cores)]})
+    # jaxlib spreads a batch of LAPACK calls over the pool that it runs them in, and waits: with as
+    # many of them at once as the pool has threads, nothing moves any more. So make it a large one.
+    os.environ.setdefault("NPROC", str(max(8, 4 * (os.cpu_count() or 1))))
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

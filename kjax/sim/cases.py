@@ -7,6 +7,7 @@ leading axis B.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -80,6 +81,7 @@ class BatchPart(NamedTuple):
     nodes: int
 
 
+@lru_cache(maxsize=8192)
 def batch_part(config: RunConfig) -> BatchPart:
     """What a config must share with others to walk in one compiled batch with them."""
     gait, bound, terrain = config.gait, config.bound, config.terrain
@@ -200,6 +202,7 @@ def stack_params(configs: Sequence[RunConfig], dtype: Any) -> tuple[ControllerPa
     return jax.tree.map(jnp.asarray, stacked), own_axes
 
 
+@lru_cache(maxsize=8192)
 def _params_part(config: RunConfig) -> RunConfig:
     """What controller parameters come from, but for command and times of requests."""
     return replace(

@@ -121,19 +121,18 @@ class MjxEngine:
         """
         require_one_batch(self.part, configs, self.torques)
         params, axes = stack_params(configs, self.dtype)
-        case, (own, own_axes) = stack_cases(configs), self._differences(configs)
-        starts = [initial_state(config, self.model.nq, self.model.nv) for config in configs]
-        qpos, qvel = (jnp.asarray(np.stack(a), self.dtype) for a in zip(*starts, strict=True))
+        models = dressed(self.model, configs)
+        case, (own, own_axes) = stack_cases(configs), self._differences(models)
+        sensed, warm = self._start(configs, models)
         delays = 1 + int(case.delay.max()) // (self._per_tick if self.torques == "held" else 1)
         ticks = ticks_of(configs[0])
         begin_call, walk_call = self._compiled(axes, own_axes, delays)
         place = _sharding(len(configs))
-        batched = jax.device_put((case, qpos, qvel), place) if place else (case, qpos, qvel)
         if place:
-            params, own = _spread(params, axes, place), jax.device_put(own, place)
-        case, qpos, qvel = batched
+            case, sensed, warm, own = jax.device_put((case, sensed, warm, own), place)
+            params = _spread(params, axes, place)
         begin, pieces, interrupted = time.perf_counter(), [], False
-        state = begin_call(params, own, case, qpos, qvel)
+        state = begin_call(params, case, sensed, warm)
         try:
             for done in range(0, ticks, _PIECE):
                 count = min(_PIECE, ticks - done)
@@ -165,9 +164,23 @@ class MjxEngine:
             interrupted=interrupted,
         )
 
-    def _differences(self, configs: Sequence[RunConfig]) -> tuple[dict[str, Any], dict[str, int]]:
+    def _start(
+        self, configs: Sequence[RunConfig], models: Sequence[mujoco.MjModel]
+    ) -> tuple[Sensed, Array]:
+        """What the robots are at first, and the solver's start: by C, which need not compile."""
+        rows = []
+        for config, model in zip(configs, models, strict=True):
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+            mujoco.mj_forward(model, data)
+            rows.append((data.qpos, data.qvel, data.sensordata, data.qacc_warmstart))
+        *sensed, warm = (jnp.asarray(np.stack(a), self.dtype) for a in zip(*rows, strict=True))
+        return Sensed(*sensed), warm
+
+    def _differences(
+        self, models: Sequence[mujoco.MjModel]
+    ) -> tuple[dict[str, Any], dict[str, int]]:
         """Fields of MJX's model that differ between the robots, stacked."""
-        models = dressed(self.model, configs)
         fields = {}
         for name in _MODEL_FIELDS:
             values = [getattr(model, name) for model in models]
@@ -192,32 +205,30 @@ class MjxEngine:
         key = (tuple(leaves), tree, tuple(own_axes), delays)
         if key not in self._calls:
 
-            def begin(params: Any, own: Any, case: Case, qpos: Array, qvel: Array) -> MjxState:
-                return self._begin(params, own, case, qpos, qvel, delays)
+            def begin(params: Any, case: Case, sensed: Sensed, warm: Array) -> MjxState:
+                return self._begin(params, case, sensed, warm, delays)
 
             def piece(params: Any, own: Any, case: Case, state: MjxState) -> Any:
                 self.traces += 1
                 return self._walk_piece(params, own, case, state)
 
             self._calls[key] = (
-                jax.jit(jax.vmap(begin, (axes, own_axes, 0, 0, 0))),
+                jax.jit(jax.vmap(begin, (axes, 0, 0, 0))),
                 jax.jit(jax.vmap(piece, (axes, own_axes, 0, 0), out_axes=(0, 1)), donate_argnums=3),
             )
         return self._calls[key]
 
     def _begin(
-        self,
-        params: ControllerParams,
-        own: dict[str, Array],
-        case: Case,
-        qpos: Array,
-        qvel: Array,
-        delays: int,
+        self, params: ControllerParams, case: Case, sensed: Sensed, warm: Array, delays: int
     ) -> MjxState:
         data = self._cast(mjx.make_data(self._mjx, **_impl_argument(self._impl)))
         # Through .at[], since a replaced host array has another layout and compiles twice.
-        data = data.replace(qpos=data.qpos.at[:].set(qpos), qvel=data.qvel.at[:].set(qvel))
-        data = _same_types(mjx.forward(self._mjx.replace(**own), data), data)
+        data = data.replace(
+            qpos=data.qpos.at[:].set(sensed.qpos),
+            qvel=data.qvel.at[:].set(sensed.qvel),
+            sensordata=data.sensordata.at[:].set(sensed.sensordata),
+            qacc_warmstart=data.qacc_warmstart.at[:].set(warm),
+        )
         return MjxState(
             data=data,
             walk=self._walk.init(params, case, _sensed(data)),

@@ -19,8 +19,8 @@ COMMON = {
     "sim.contacts": "feet",
     "terrain.kind": "paper",
     "terrain.count": 3,
-    "terrain.start": 0.15,
-    "terrain.end": 0.4,
+    "terrain.start": 0.4,
+    "terrain.end": 0.7,
     "lmpc.height_above": "feet",
 }
 OWN = (

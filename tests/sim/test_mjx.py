@@ -1,88 +1,94 @@
-"""The same controller in C MuJoCo and inside a scan on MJX: the engines must agree."""
+"""The same closed loops in C MuJoCo and on MJX: the engines must agree."""
 
-import jax
-import mujoco
+import dataclasses
+
 import numpy as np
 import pytest
-from mujoco import mjx
 
-from kjax import RunConfig, build_controller, build_params, load_config
-from kjax.robots import go1
+from kjax import RunConfig, load_config
 from kjax.sim import mjx_loop
-from kjax.sim.episode import initial_state, sensor_noise
-from kjax.sim.mujoco_loop import build_simulation, simulate
-from kjax.sim.observe import add_noise, build_observe
+from kjax.sim.batch_loop import BatchEngine
 
-TICKS, PER_TICK = 60, 5
+COMMON = {
+    "duration": 0.3,
+    "sim.contacts": "feet",
+    "terrain.kind": "blocks",
+    "terrain.count": 2,
+    "terrain.start": 0.45,
+    "terrain.end": 0.7,
+}
+# A robot each of its own field, friction, payload, delay, push and command; the last one falls.
+OWN = (
+    {"terrain.seed": 1},
+    {"command.velocities": [0.3] * 5, "sim.friction": 0.5, "sim.payload": 1.0},
+    {"push.times": [0.1], "push.forward": 2.0, "sim.delay": 0.002},
+    {"push.times": [0.0], "push.forward": 120.0},
+)
 
 
 @pytest.fixture(scope="module")
-def config():
-    chosen = {"duration": 0.3, "sim.contacts": "feet", "push.times": [0.1], "push.forward": 2.0}
-    return load_config(RunConfig, None, chosen)
+def configs():
+    return [
+        dataclasses.replace(load_config(RunConfig, None, COMMON | own), seed=i)
+        for i, own in enumerate(OWN)
+    ]
 
 
 @pytest.fixture(scope="module")
-def both(config):
-    controller, params = build_controller(config), build_params(config, go1.PARAMS)
-    simulation = mjx_loop.build_mjx(config, controller)
-    observe = build_observe(simulation.model, config.sim.contact_threshold)
-    noise = sensor_noise(config, TICKS * PER_TICK)
+def engine(configs):
+    return mjx_loop.MjxEngine(configs[0], dtype=np.float64)
 
-    @jax.jit
-    def run(qpos, qvel, noise):
-        data = simulation.reset(qpos, qvel)
-        seen = add_noise(observe(data.qpos, data.qvel, data.sensordata), noise[0, 0])
-        return simulation.run(params, controller.init(params, seen), data, noise)
 
-    start = initial_state(config, simulation.model.nq, simulation.model.nv)
-    _, _, log = run(*start, noise.reshape(TICKS, PER_TICK, -1))
-    in_c = simulate(build_simulation(config)._replace(model=simulation.model))
-    return jax.device_get(log), in_c
+@pytest.fixture(scope="module")
+def both(engine, configs):
+    in_c = BatchEngine(configs[0], dtype=np.float64, threads=1)
+    in_c.model = engine.model  # with MJX's number of solver iterations
+    return engine.run(configs), in_c.run(configs)
 
 
 @pytest.mark.slow
 def test_three_tenths_of_a_second_of_trot_agree(both):
-    log, in_c = both
+    on_mjx, in_c = both
     # Past the first swap of the diagonals at 0.25 s. 1e-9: equal algorithms in double precision;
-    # what differs is the order of sums, which contacts amplify (1e-15 measured).
-    np.testing.assert_allclose(log.qpos.reshape(-1, 15), in_c.qpos, atol=1e-9)
-    np.testing.assert_allclose(log.qvel.reshape(-1, 15), in_c.qvel, atol=1e-7)
-    np.testing.assert_allclose(log.torque.reshape(-1, 4, 3), in_c.torque, atol=1e-6)
+    # what differs is the order of sums, which contacts amplify (1e-15 measured). This also guards
+    # the pair of mujoco and mujoco-mjx that the constraints file pins.
+    for i in range(3):
+        np.testing.assert_allclose(on_mjx.qpos[:, i], in_c.qpos[:, i], atol=1e-9)
+        np.testing.assert_allclose(on_mjx.qvel[:, i], in_c.qvel[:, i], atol=1e-7)
+        np.testing.assert_allclose(on_mjx.torque[:, i], in_c.torque[:, i], atol=1e-6)
+        np.testing.assert_allclose(on_mjx.log.x[:, i], in_c.log.x[:, i], atol=1e-7)
+        np.testing.assert_array_equal(on_mjx.log.stance[:, i], in_c.log.stance[:, i])
+    assert (on_mjx.log.status[:, :3] == 0).all()
+    assert in_c.log.stance[0, 0].tolist() == [True, False, False, True]
+    assert in_c.log.stance[-1, 0].tolist() == [False, True, True, False]
 
 
 @pytest.mark.slow
-def test_both_were_pushed(both):
-    log, in_c = both
-    for speed in (log.qvel.reshape(-1, 15)[:, 0], in_c.qvel[:, 0]):
-        # 2 N s on 12.7 kg, of which the stance legs take back a part while it acts
-        assert 0.05 < speed[200] - speed[100] < 2.0 / 12.743
+def test_the_robots_met_different_worlds(both):
+    on_mjx, _ = both
+    last = on_mjx.qpos[-1, :3]
+    assert len({tuple(np.round(row, 3)) for row in last}) == 3
+    pushed = on_mjx.qvel[:, 2, 0]
+    # 2 N s on 12.7 kg, of which the stance legs take back a part while it acts
+    assert 0.05 < pushed[40] - pushed[20] < 2.0 / 12.743
 
 
 @pytest.mark.slow
-def test_the_run_walks_and_swaps_its_diagonals(both):
-    log, in_c = both
-    assert (log.info.status == 0).all()
-    assert in_c.stance[0].tolist() == [True, False, False, True]
-    assert in_c.stance[-1].tolist() == [False, True, True, False]
+def test_a_fallen_robot_is_flagged_and_frozen(both):
+    on_mjx, in_c = both
+    assert on_mjx.fell.tolist() == in_c.fell.tolist() == [False, False, False, True]
+    assert on_mjx.ticks[3] == in_c.ticks[3] < 60
+    after = on_mjx.qpos[on_mjx.ticks[3] :, 3]
+    np.testing.assert_array_equal(after, np.broadcast_to(after[0], after.shape))
+    assert len(on_mjx.trajectory(3).time) == on_mjx.ticks[3]
 
 
 @pytest.mark.slow
-def test_one_step_of_the_pinned_pair_of_engines_agrees(config):
-    """Guards the pair of mujoco and mujoco-mjx that the constraints file pins."""
-    model = mjx_loop.build_model(config)
-    qpos, qvel = initial_state(config, model.nq, model.nv)
-    qpos[1] -= 0.003  # feet in the ground: contact forces at work
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
-    mujoco.mj_step(model, data)
-    device = mjx.put_model(model)
-    start = mjx.make_data(device)
-    start = start.replace(qpos=start.qpos.at[:].set(qpos), qvel=start.qvel.at[:].set(qvel))
-    stepped = jax.jit(mjx.step)(device, start)
-    np.testing.assert_allclose(stepped.qpos, data.qpos, atol=1e-12)
-    # 1e-9: the contact solver's own tolerance
-    np.testing.assert_allclose(stepped.qvel, data.qvel, atol=1e-9)
+def test_other_seeds_and_worlds_do_not_compile_again(engine, both, configs):
+    other = [dataclasses.replace(config, seed=config.seed + 10) for config in configs]
+    again = engine.run(other)
+    assert engine.traces == 1
+    assert not np.array_equal(again.qpos[-1, 0], both[0].qpos[-1, 0])
 
 
 def test_mjx_refuses_what_it_cannot_simulate():

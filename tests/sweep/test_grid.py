@@ -1,0 +1,92 @@
+"""From a sweep's file to its cases, and what it says where that cannot be."""
+
+import numpy as np
+import pytest
+
+from kjax.config import ConfigError, SweepConfig, load_config
+from kjax.sweep.grid import evaluate, plan
+
+SWEEP = """
+base = "walk.toml"
+seeds = 2
+first_seed = 5
+[axes.speed]
+values = [0.2, 0.4]
+unit = "m/s"
+[axes.duty]
+low = 0.1
+high = 0.3
+count = 3
+[set]
+"command.velocities" = [0.0, "= speed"]
+"bound.front_stance" = "= duty * 0.4 / 2 + 0.05"
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "walk.toml").write_text("[command]\ntimes = [0.0, 1.0]\nvelocities = [0.0, 0.0]\n")
+    path = tmp_path / "sweep.toml"
+    path.write_text(SWEEP)
+    return path
+
+
+def test_a_grid_is_every_value_with_every_other_and_every_seed(file):
+    cases = plan(load_config(SweepConfig, file), file)
+    assert cases.dims == ("speed", "duty", "seed")
+    assert cases.shape == (2, 3, 2)
+    assert len(cases.cases) == 12
+    at = np.empty(12, object)
+    at[:] = cases.cases
+    one = at.reshape(cases.shape)[1, 2, 1]
+    assert one.command.velocities == (0.0, 0.4)
+    assert one.bound.front_stance == pytest.approx(0.11, abs=1e-12)
+    assert (one.seed, one.terrain.seed) == (6, 6)
+    dims, values, unit = cases.coords["duty"]
+    assert dims == ("duty",)
+    np.testing.assert_allclose(values, [0.1, 0.2, 0.3])
+    assert cases.coords["speed"][2] == "m/s"
+    assert unit == "-"
+
+
+def test_a_sample_is_drawn_from_the_ranges_and_again_the_same(file):
+    file.write_text(
+        SWEEP.replace("values = [0.2, 0.4]", "low = 0.2\nhigh = 0.4").replace("count = 3", "")
+        .replace("seeds = 2", "seeds = 1\nsample = 40")
+    )  # fmt: skip
+    sweep = load_config(SweepConfig, file)
+    cases, again = plan(sweep, file), plan(sweep, file)
+    assert cases.cases == again.cases
+    assert cases.dims == ("sample", "seed")
+    speeds = [case.command.velocities[1] for case in cases.cases]
+    np.testing.assert_array_equal(speeds, cases.coords["speed"][1])
+    assert 0.2 <= min(speeds) < 0.23
+    assert 0.37 < max(speeds) <= 0.4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"= speed"', '"= sped"', r"set\.command\.velocities: no axis named 'sped'"),
+        ('"= speed"', '"= __import__(1)"', r"wanted numbers, axes and"),
+        ('"= speed"', '"= speed +"', r"wanted numbers, axes and"),
+        ('"= speed"', '"fast"', r"at speed = 0\.2.*command\.velocities"),
+        ('"command.velocities"', '"command.velocity"', r"command\.velocity: unknown key"),
+        ("count = 3", "", r"axes\.duty: a grid needs a count"),
+        ("values = [0.2, 0.4]", "", r"axes\.speed: give either values, or low and high"),
+        ("high = 0.3", "high = 0.05", r"low must be below high"),
+        ("seeds = 2", "seed = 2", r"seed: unknown key.*did you mean 'seeds'"),
+        ("axes.speed", "axes.seed", r"axes\.seed: wanted a name"),
+        ("walk.toml", "run.toml", r"run\.toml: no such file"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_the_key(file, old, new, said):
+    file.write_text(SWEEP.replace(old, new))
+    with pytest.raises(ConfigError, match=said) as error:
+        plan(load_config(SweepConfig, file), file)
+    assert "\n" not in str(error.value)
+
+
+def test_expressions_are_arithmetic():
+    names = {"a": 3.0, "b": 2.0}
+    assert evaluate("(a + 1) / b - -2 * a", names, "key") == pytest.approx(8.0)
