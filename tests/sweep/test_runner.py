@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -232,9 +233,12 @@ def test_two_processes_over_jax_distributed_equal_one(file, tmp_path, repository
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
 
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
     alone = [start(tmp_path / "one")]
     pair = [
-        start(tmp_path / "two", "--coordinator", "127.0.0.1:12397", "--processes", "2",
+        start(tmp_path / "two", "--coordinator", address, "--processes", "2",
               "--process", str(number))
         for number in range(2)
     ]  # fmt: skip
