@@ -2,8 +2,10 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from mujoco.mjx._src import math as mjx_math
 
 from kjax import RunConfig, load_config
 from kjax.sim import mjx_loop
@@ -39,11 +41,23 @@ def engine(configs):
     return mjx_loop.MjxEngine(configs[0], dtype=np.float64)
 
 
+def closest_segment_point(a, b, point):
+    along = b - a
+    fraction = jnp.dot(point - a, along) / jnp.dot(along, along)
+    return a + jnp.clip(fraction, 0.0, 1.0) * along
+
+
 @pytest.fixture(scope="module")
 def both(engine, configs):
     in_c = BatchEngine(configs[0], dtype=np.float64, threads=1)
     in_c.model = engine.model  # with MJX's number of solver iterations
-    return engine.run(configs), in_c.run(configs)
+    with pytest.MonkeyPatch.context() as patch:
+        # MJX adds 1e-6 m^2 to the edge's squared length where a sphere touches the edge of a box,
+        # which moves the contact along the edge by micrometres; robot 1 strikes one at 0.145 s.
+        # Without that the two engines are one algorithm, and that is what is tested here.
+        patch.setattr(mjx_math, "closest_segment_point", closest_segment_point)
+        on_mjx = engine.run(configs)
+    return on_mjx, in_c.run(configs)
 
 
 @pytest.mark.slow
@@ -52,9 +66,8 @@ def test_three_tenths_of_a_second_of_trot_agree(both):
     # Past the first swap of the diagonals at 0.25 s. 1e-9: equal algorithms in double precision;
     # what differs is the order of sums, which contacts amplify (1e-15 measured). This also guards
     # the pair of mujoco and mujoco-mjx that the constraints file pins.
-    # Robot 1 parts by 7e-6 after 0.145 s, for a reason not found yet: neither the contact solver's
-    # iterations (6 or 30) nor its tolerance (1e-8 or 0) nor its low friction is it.
-    for i, near in ((0, 1e-9), (1, 3e-5), (2, 1e-9)):
+    near = 1e-9
+    for i in range(3):
         np.testing.assert_allclose(on_mjx.qpos[:, i], in_c.qpos[:, i], atol=near)
         np.testing.assert_allclose(on_mjx.qvel[:, i], in_c.qvel[:, i], atol=100 * near)
         np.testing.assert_allclose(on_mjx.torque[:, i], in_c.torque[:, i], atol=1000 * near)
