@@ -67,12 +67,15 @@ def study(name: str, words: list[str]) -> None:
     parser = cli.script_parser(__doc__)
     parser.prog = f"benchmark.py {name}"
     parser.add_argument("--quick", action="store_true", help="less of it: to check the script")
+    module = STUDIES[name]
+    if hasattr(module, "add_arguments"):
+        module.add_arguments(parser)
     args = parser.parse_args(words)
     args.out = args.out or Path("results") / f"benchmark_{name}"
     args.config = None
     folder = cli.output_folder(args, f"benchmark_{name}")
     cli.configure_jax(one_core=name == "qp")
-    result = STUDIES[name].run(folder, quick=args.quick)
+    result = module.run(folder, args)
     cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"results in {folder}/")

@@ -1,5 +1,6 @@
 """The QP solvers beside their peers, on the QPs of closed loops; run by benchmark.py qp."""
 
+import argparse
 import importlib
 import time
 from collections.abc import Callable
@@ -10,29 +11,47 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+import qp_checks
 from qp_peers import box_peers, daqp_cold
 from qp_problems import record_box, record_rows
 
-from kjax import qp
+from kjax import cli, qp
 
 BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
-HORIZONS = {40: 10, 80: 20, 200: 50}  # variables: steps of 20 ms of the long trot
+HORIZONS = {40: 10, 80: 20, 200: 50, 400: 100}  # variables: steps of 20 ms of the long trot
+SLOW = ("clarabel", "qpax", "piqp")  # left out at 400 variables
 ROUNDS = 3  # of every timing; the medians over all calls are reported
 PEERS = ("daqp", "quadprog", "osqp", "proxsuite", "piqp", "clarabel", "qpSWIFT", "qpax")
+GAITS = ("trot_velocity", "bound_velocity")
+RANDOM = 1_000_000  # warm-started solves that are judged
 
 
-def run(folder: Path, *, quick: bool) -> dict[str, Any]:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument(
+        "--problems",
+        type=Path,
+        metavar="DIR",
+        help="QPs to solve to 1e-9: a folder of .npz with P, q, G, h, A, b, lb, ub",
+    )
+
+
+def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     """All measurements; leaves figure.png and table.md in the folder."""
-    seconds = 1.0 if quick else 6.0
+    quick, seconds = args.quick, 1.0 if args.quick else 6.0
+    if args.problems is not None and not any(args.problems.glob("*.npz")):
+        cli.fail(f"--problems: no .npz file in {args.problems}")
     present = {name: _import(name) for name in PEERS}
     missing = [name for name, module in present.items() if module is None]
     if missing:
         print(f"not installed, left out: {', '.join(missing)} (pip install -e '.[peers]')")
     peers = {name: module for name, module in present.items() if module is not None}
-    result: dict[str, Any] = {"missing": missing, "box": {}, "batch": {}, "size": {}, "rows": {}}
-    for name in ("trot_velocity", "bound_velocity"):
+    result: dict[str, Any] = {"missing": missing}
+    result |= {part: {} for part in ("box", "batch", "size", "rows", "gradient")}
+    for name in GAITS:
         print(f"{name}: 24 variables")
         log = record_box(name, seconds)
+        result["gradient"][name] = qp_checks.gradients(log, 100 if quick else 1000)
         result["box"][name] = box_single(log, peers)
         result["box"][name] |= box_in_scan(log)
         sizes = BATCHES[:4] if quick else BATCHES
@@ -40,13 +59,59 @@ def run(folder: Path, *, quick: bool) -> dict[str, Any]:
     for variables, steps in HORIZONS.items():
         print(f"trot_velocity_long: {variables} variables")
         log = record_box("trot_velocity_long", 0.5, {"lmpc.horizon": steps})
-        result["size"][variables] = box_single(log, peers, count=50)
+        fast = {k: v for k, v in peers.items() if variables < 400 or k not in SLOW}
+        result["size"][variables] = box_single(log, fast, count=50)
+        if variables >= 200:
+            result["size"][variables] |= {
+                name: {"us_median": us}
+                for name, us in qp_checks.riccati_step(steps, states=13, inputs=4).items()
+            }
+        if quick:
+            break
     result["size"][24] = result["box"]["trot_velocity"]
     print("bound_multiphase: rows")
     result["rows"] = rows_single(record_rows(seconds), peers)
+    print("random problems")
+    result["random"] = qp_checks.random_solves(RANDOM // 100 if quick else RANDOM)
+    if args.problems is not None:
+        print(f"problems in {args.problems}")
+        result["public"] = qp_checks.public_problems(args.problems, peers)
+    result |= summary(result)
     (folder / "table.md").write_text(table(result), encoding="utf-8")
     figure(result, folder / "figure.png")
     return result
+
+
+def summary(result: dict[str, Any]) -> dict[str, Any]:
+    """The figures that matter; where there are two gaits, the worse one. None if not measured."""
+
+    def ratio(of: str, to: str, worst: Callable[..., Any]) -> Any:
+        pairs = [(g.get(of), g.get(to)) for g in result["box"].values()]
+        if any(a is None or b is None for a, b in pairs):
+            return None
+        return worst(a["us_median"] / b["us_median"] for a, b in pairs)
+
+    single, scan = "kjax tableau, warm", "kjax in a scan, value"
+    batches = [b.get("1024") or b[max(b, key=int)] for b in result["batch"].values()]
+    loops = [b["daqp loop"] / b["kjax"] for b in batches if "daqp loop" in b]
+    rows = {name: entry["us_median"] for name, entry in result["rows"].items()}
+    rivals = [us for name, us in rows.items() if name.startswith(("PIQP", "ProxQP"))]
+    return {
+        "single_over_daqp_cold": ratio(single, "daqp, cold", max),
+        "qpswift_over_single": ratio("qpSWIFT", single, min),
+        "osqp_over_single": ratio("OSQP 1e-6", single, min),
+        "qpax_over_single": ratio("qpax", single, min),
+        "scan_over_daqp_warm": ratio(scan, "daqp, warm", max),
+        "batch1024_over_daqp": min(loops) if loops else None,
+        "grad_rel_err_median": max(g["median"] for g in result["gradient"].values()),
+        "grad_rel_err_max": max(g["max"] for g in result["gradient"].values()),
+        "grad_over_value": ratio("kjax in a scan, value and gradient", scan, max),
+        "rows_over_best_of_piqp_proxqp": (
+            rows["kjax active_set"] / min(rivals) if rivals else None
+        ),
+        "mpc_qpbenchmark_solved_1e9": result.get("public", {}).get("solved_1e9"),
+        "random_wrong_solved": result["random"]["wrong_solved"],
+    }
 
 
 def _import(name: str) -> Any:
@@ -296,6 +361,23 @@ def table(result: dict[str, Any]) -> str:
     for name, entry in result["rows"].items():
         apart = entry["apart_from_active_set_max_N"]
         lines.append(f"| {name} | {entry['us_median']:.0f} | {apart:.1e} |")
+    checks = result["random"]
+    lines += [
+        "",
+        f"{checks['solves']:,} random solves, warm-started: {checks['wrong_solved']} wrong, "
+        f"{checks['iteration_limit']} at the iteration limit, {checks['other_status']} refused.",
+    ]
+    for name, entry in result["gradient"].items():
+        lines.append(
+            f"Gradient against differences, {name}: median {entry['median']:.0e}, "
+            f"max {entry['max']:.0e} of {entry['problems']} problems."
+        )
+    if "public" in result:
+        entry = result["public"]
+        lines.append(
+            f"Public problems: {entry['solved_1e9']} of {entry['problems']} to 1e-9, "
+            f"{entry['over_daqp_median']:.1f} times daqp's time (median)."
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -303,16 +385,19 @@ def figure(result: dict[str, Any], path: Path) -> None:
     """Cost against the number of variables, and against the batch."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     sizes = sorted(int(k) for k in result["size"])
-    names = [n for n in result["size"][sizes[0]] if "scan" not in n and "empty" not in n]
     by_size = {int(k): v for k, v in result["size"].items()}
+    names = dict.fromkeys(n for s in sizes for n in by_size[s] if "in a scan" not in n)
     for name in names:
+        if name == "empty jitted call":
+            continue
         ours = name.startswith("kjax")
+        there = [n for n in sizes if name in by_size[n]]
         left.loglog(
-            sizes,
-            [by_size[n][name]["us_median"] for n in sizes],
+            there,
+            [by_size[n][name]["us_median"] for n in there],
             "o-" if ours else ".-",
             lw=2.5 if ours else 1.0,
-            label=name,
+            label=f"one step of: {name}" if name.startswith("riccati") else name,
         )
     left.set(xlabel="variables", ylabel="single call from Python [us]", title="QPs of the trot")
     left.set_xticks(sizes, [str(n) for n in sizes])

@@ -1,5 +1,6 @@
 """Closed loops per second of both engines beside the bare ones; for benchmark.py simulation."""
 
+import argparse
 import dataclasses
 import os
 import resource
@@ -32,8 +33,9 @@ WALK = 0.5  # s of walking that is timed in C
 WALK_MJX = 0.25
 
 
-def run(folder: Path, *, quick: bool) -> dict[str, Any]:
+def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     """All measurements; leaves figure.png and table.md in the folder."""
+    quick = args.quick
     jax.config.update("jax_enable_x64", False)
     batches = BATCHES[:3] if quick else BATCHES
     rounds = 2 if quick else ROUNDS

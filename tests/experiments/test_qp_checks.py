@@ -1,0 +1,75 @@
+"""What the QP benchmark counts: its judges judge, and they find the solvers right."""
+
+import importlib
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kjax import qp
+
+PUBLIC = Path(__file__).parents[3] / "shared" / "data" / "mpc_qpbenchmark"
+
+
+@pytest.fixture(scope="module")
+def checks(repository):
+    sys.path.insert(0, str(repository / "experiments"))
+    yield importlib.import_module("qp_checks")
+    sys.path.remove(str(repository / "experiments"))
+
+
+def test_the_judge_tells_a_minimiser_from_what_is_none(checks, random_qp):
+    H, q, lower, upper, x = random_qp(0)
+    assert checks.independent_residual(H, q, lower, upper, x) < 1e-14
+    for wrong in (x + 1e-3 * (upper - lower) * np.eye(12)[2], x + 1e-3, np.full(12, np.nan)):
+        assert not checks.independent_residual(H, q, lower, upper, wrong) <= 1e-5
+    # 0.1 past an upper bound is outside, however little the gradient minds.
+    outside = np.where(np.arange(12) == 1, upper + 0.1, x)
+    assert checks.independent_residual(H, q, lower, upper, outside) == np.inf
+
+
+def test_no_random_problem_is_called_solved_that_is_not(checks, monkeypatch):
+    monkeypatch.setattr(checks, "SIZES", (6, 20))
+    monkeypatch.setattr(checks, "BATCH", 32)
+    found = checks.random_solves(1)
+    assert found["solves"] == 2 * 32 * checks.TICKS
+    assert found["wrong_solved"] == found["other_status"] == 0
+    assert found["iteration_limit"] <= 4
+
+
+def test_a_solver_that_lies_is_found_out(checks, monkeypatch):
+    monkeypatch.setattr(checks, "SIZES", (6,))
+    monkeypatch.setattr(checks, "BATCH", 32)
+
+    def lie(prepared, q, lower, upper, warm, **options):
+        point = jnp.clip(-q, lower, upper)
+        return Namespace(warm=warm, x=point, status=jnp.asarray(qp.Status.SOLVED))
+
+    monkeypatch.setattr(checks.qp, "solve", lie)
+    assert checks.random_solves(1)["wrong_solved"] > 0.9 * 32 * checks.TICKS
+
+
+def test_gradients_are_those_of_differences(checks, random_qp):
+    problems = [random_qp(seed)[:4] for seed in range(4)]
+    H, q, lower, upper = (np.stack(part) for part in zip(*problems, strict=True))
+    log = {
+        "prepared": jax.vmap(qp.prepare)(jnp.asarray(H)),
+        "mode": np.arange(4),
+        "q": q,
+        "lower": lower,
+        "upper": upper,
+    }
+    found = checks.gradients(log, 4)
+    assert found["problems"] >= 3
+    assert found["max"] < 1e-8
+
+
+@pytest.mark.skipif(not PUBLIC.is_dir(), reason="the public problems are not beside the checkout")
+def test_public_problems_are_solved_to_1e_9(checks, monkeypatch):
+    monkeypatch.setattr(checks, "_median_us", lambda call: 1.0)  # no speed in tests
+    found = checks.public_problems(PUBLIC, {})
+    assert (found["problems"], found["solved_1e9"]) == (30, 30)
