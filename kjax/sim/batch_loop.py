@@ -24,7 +24,15 @@ import numpy as np
 
 from kjax.config import RunConfig
 from kjax.params import ControllerParams
-from kjax.sim.cases import BatchPart, Case, batch_part, push_at, stack_cases, stack_params
+from kjax.sim.cases import (
+    BatchPart,
+    Case,
+    batch_part,
+    check_engine,
+    push_at,
+    stack_cases,
+    stack_params,
+)
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import resolve
 from kjax.sim.push import pushed_body
@@ -357,15 +365,7 @@ def require_one_batch(part: BatchPart, configs: Sequence[RunConfig], torques: st
                 f"configs[{i}].duration is {config.duration} s, the first one's "
                 f"{configs[0].duration} s; one batch has one duration"
             )
-        tick = config.lmpc.control_dt
-        if (
-            torques == "held"
-            and abs(config.sim.delay / tick - round(config.sim.delay / tick)) > 1e-6
-        ):
-            raise ValueError(
-                f"with held torques sim.delay must be a multiple of lmpc.control_dt {tick} s, got "
-                f"{config.sim.delay} s"
-            )
+        check_engine(config, torques=torques)
 
 
 def _rows(params: ControllerParams, axes: Any, rows: slice) -> ControllerParams:

@@ -222,3 +222,24 @@ def _filled(values: Any, count: int, rest: Any) -> np.ndarray:
     """Values, filled up to ``count`` of them."""
     values = np.asarray(values, float)
     return np.concatenate([values, np.full(count - len(values), float(rest))])
+
+
+def check_engine(config: RunConfig, *, engine: str = "c", torques: str = "every_step") -> None:
+    """Raise a ValueError that says why an engine cannot walk a config, if it cannot.
+
+    Args:
+      config: of a robot.
+      engine: ``"c"`` or ``"mjx"``.
+      torques: ``"every_step"`` or ``"held"``.
+    """
+    tick, delay = config.lmpc.control_dt, config.sim.delay
+    if torques == "held" and abs(delay / tick - round(delay / tick)) > 1e-6:
+        raise ValueError(
+            f"with torques = 'held' sim.delay must be a multiple of lmpc.control_dt {tick} s, got "
+            f"{delay} s"
+        )
+    if engine == "mjx" and (config.sim.contacts != "feet" or config.sim.cone != "pyramidal"):
+        raise ValueError(
+            "MJX needs sim.contacts = 'feet' and sim.cone = 'pyramidal', got "
+            f"'{config.sim.contacts}' and '{config.sim.cone}'"
+        )

@@ -26,7 +26,14 @@ from kjax.sim.batch_loop import (
     require_one_batch,
     ticks_of,
 )
-from kjax.sim.cases import Case, batch_part, push_at, stack_cases, stack_params
+from kjax.sim.cases import (
+    Case,
+    batch_part,
+    check_engine,
+    push_at,
+    stack_cases,
+    stack_params,
+)
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import resolve
 from kjax.sim.push import pushed_body
@@ -58,11 +65,7 @@ class MjxState(NamedTuple):
 
 def build_model(config: RunConfig) -> mujoco.MjModel:
     """The scene with the options that MJX needs: few solver iterations, feet-only contacts."""
-    if config.sim.contacts != "feet" or config.sim.cone != "pyramidal":
-        raise ValueError(
-            "MJX needs sim.contacts = 'feet' and sim.cone = 'pyramidal', got "
-            f"'{config.sim.contacts}' and '{config.sim.cone}'"
-        )
+    check_engine(config, engine="mjx")
     spec = build_spec(config.sim, config.terrain, visual=False)
     spec.option.iterations = 6
     spec.option.ls_iterations = 8

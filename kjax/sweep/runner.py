@@ -11,9 +11,9 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from kjax.config import RunConfig, SweepConfig, load_config, to_dict
+from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dict
 from kjax.episodes import code_version
-from kjax.sim.cases import BatchPart, batch_part
+from kjax.sim.cases import BatchPart, batch_part, check_engine
 from kjax.sweep.grid import plan
 from kjax.sweep.store import Store, columns, lock, restart
 
@@ -80,6 +80,11 @@ def run_sweep(
       KeyboardInterrupt: on Ctrl-C; finished chunks are kept.
     """
     cases = plan(sweep, file)
+    for config in cases.cases:
+        try:
+            check_engine(config, engine=sweep.engine, torques=sweep.torques)
+        except ValueError as error:
+            raise ConfigError(f"{file}: {error}") from None
     chunks = chunks_of(cases.cases, sweep.chunk)
     meet = barrier or (lambda name: None)
     with lock(folder, f"lock.{process}" if processes > 1 else "lock"):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from kjax.config import SweepConfig, load_config
+from kjax.config import ConfigError, SweepConfig, load_config
 from kjax.sweep import runner, store
 from kjax.sweep.runner import chunks_of, run_sweep
 from kjax.sweep.store import StoreError
@@ -64,6 +64,23 @@ def calls(monkeypatch):
 
 def walk(file, folder, **more):
     return run_sweep(load_config(SweepConfig, file), file, folder, **more)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('torques = "held"\n', r"sim\.delay must be a multiple of lmpc\.control_dt 0\.005"),
+        ('engine = "mjx"\n', r"MJX needs sim\.contacts = 'feet'.*got 'all'"),
+    ],
+)
+def test_what_the_engine_cannot_walk_is_refused_before_anything_is_written(
+    file, tmp_path, line, message
+):
+    text = SWEEP.replace('"feet"', '"all"') if "mjx" in line else SWEEP + '"sim.delay" = 0.002\n'
+    file.write_text(line + text)
+    with pytest.raises(ConfigError, match=message):
+        run_sweep(load_config(SweepConfig, file), file, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_dataset_has_every_case_in_its_place(file, tmp_path, calls):
