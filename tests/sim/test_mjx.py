@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -76,6 +77,13 @@ def test_three_tenths_of_a_second_of_trot_agree(both):
     assert (on_mjx.log.status[:, :3] == 0).all()
     assert in_c.log.stance[0, 0].tolist() == [True, False, False, True]
     assert in_c.log.stance[-1, 0].tolist() == [False, True, True, False]
+
+
+@pytest.mark.slow
+def test_the_batch_lay_on_both_devices():
+    assert jax.local_device_count() == 2  # see conftest; on one device nothing would be tested
+    assert len(mjx_loop._sharding(4).device_set) == 2
+    assert mjx_loop._sharding(3) is None
 
 
 @pytest.mark.slow
