@@ -7,6 +7,7 @@ The forces F and the foot positions r are in the *body* frame, as in the paper; 
 stance legs at each end and so selects the contact mode. State and input order: ``kjax.types``.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -57,6 +58,47 @@ def dynamics(
     return jnp.concatenate([x[3:], accel, moment.sum()[None] / params.inertia])
 
 
+def planted_dynamics(
+    params: SrbParams,
+    alpha: Float[Array, "2"],
+    ground: Float[Array, "2 2"],
+    x: Float[Array, "6"],
+    u: Float[Array, "4"],
+    *,
+    world_forces: bool = False,
+) -> Float[Array, "6"]:
+    """Time derivative of the state with feet that stay where they stand on the ground.
+
+        theta'' = ((P_f - p) x alpha_f F_f + (P_r - p) x alpha_r F_r) / I,   all in the world frame
+
+    Args:
+      params: mass and inertia; its contact points are of no effect.
+      alpha: (2,) number of stance legs at the front and at the rear.
+      ground: (2, 2) contact points P (front, rear) x (x, z), world frame [m].
+      x: (6,) state.
+      u: (4,) force of one front and one rear leg [N].
+      world_forces: whether ``u`` is in the world frame rather than in the body's.
+    """
+    force = alpha[:, None] * u.reshape(2, 2)
+    if not world_forces:
+        force = force @ planar_rotation(x[2]).T
+    arm = ground - x[:2]
+    moment = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
+    accel = force.sum(axis=0) / params.mass - jnp.array([0.0, GRAVITY], x.dtype)
+    return jnp.concatenate([x[3:], accel, moment.sum()[None] / params.inertia])
+
+
+def rk4(
+    derivative: Callable[[Float[Array, "n"]], Float[Array, "n"]], x: Float[Array, "n"], dt: float
+) -> Float[Array, "n"]:
+    """State after ``dt`` [s] of x' = derivative(x): classical Runge-Kutta of order 4."""
+    k1 = derivative(x)
+    k2 = derivative(x + 0.5 * dt * k1)
+    k3 = derivative(x + 0.5 * dt * k2)
+    k4 = derivative(x + dt * k3)
+    return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
 def rk4_step(
     params: SrbParams,
     alpha: Float[Array, "2"],
@@ -64,12 +106,13 @@ def rk4_step(
     u: Float[Array, "4"],
     dt: float,
 ) -> Float[Array, "6"]:
-    """State (6,) after ``dt`` [s] under a held input: classical Runge-Kutta of order 4."""
-    k1 = dynamics(params, alpha, x, u)
-    k2 = dynamics(params, alpha, x + 0.5 * dt * k1, u)
-    k3 = dynamics(params, alpha, x + 0.5 * dt * k2, u)
-    k4 = dynamics(params, alpha, x + dt * k3, u)
-    return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    """State (6,) after ``dt`` [s] under a held input, by ``rk4``."""
+    return rk4(lambda x: dynamics(params, alpha, x, u), x, dt)
+
+
+def contact_points(x: Float[Array, "6"], feet: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+    """World positions (2, 2) of contact points given from the centre of mass in the body frame."""
+    return x[:2] + feet @ planar_rotation(x[2]).T
 
 
 def rollout(

@@ -62,13 +62,36 @@ class DatasetConfig:
 class KoopmanConfig:
     """EDMD models, one per contact mode."""
 
-    dictionary: Literal["paper", "paper_literal"] = "paper"
-    """The paper's dictionary without its duplicate columns, or letter by letter [-]."""
+    model: Literal[
+        "linear", "srb_hover", "srb", "planted", "exact", "bilinear", "residual", "learned"
+    ] = "linear"
+    """Kind of prediction model, see kjax.koopman.families; the paper's is linear. All but it are
+    linearised at every tick where the robot is [-]."""
+    file: str = ""
+    """Numbers of the model, written by koopman_study.py; needed by residual and learned [-]."""
+    dictionary: Literal["paper", "paper_literal", "monomials", "fourier"] = "paper"
+    """The paper's dictionary without its duplicate columns, or letter by letter; or products of
+    states; or random Fourier features [-]."""
     order: Annotated[int, Field(ge=0, le=8)] = 4
-    """Highest power p of the pitch rate in the dictionary [-]."""
+    """Highest power p of the pitch rate in the paper's dictionary, or highest degree of the
+    monomials [-]."""
+    fourier_count: Count = 20
+    """Number of random Fourier features [-]."""
+    fourier_scale: Positive = 1.0
+    """Their spread of frequencies, for states of a walking robot's size [-]."""
+    fourier_seed: int = 0
+    """Seed of their draw [-]."""
     constant_rotation: bool = False
     """Whether to add R itself (the k = 0 term), which the paper leaves out [-]."""
     feet: Literal["fixed", "measured"] = "fixed"
     """Contact points of the model: constant per mode (the paper) or the robot's own [-]."""
     dataset: DatasetConfig = DatasetConfig()
     """Training data."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "KoopmanConfig":
+        if self.model in ("residual", "learned") and not self.file:
+            raise ValueError(f"model = '{self.model}' needs a file with its numbers")
+        if self.model not in ("residual", "learned") and self.file:
+            raise ValueError(f"model = '{self.model}' takes no file, got '{self.file}'")
+        return self

@@ -2,9 +2,9 @@
 
 The paper writes K = G_1 G_2^-1 with G_2 = mean(Pi [Pi; u]^T), which is not square; the regression
 wants the Gram matrix of the full regressor [Pi; u]. We do not form a Gram matrix at all, since it
-squares the condition number: the columns are scaled to unit norm and the least-squares problem is
-solved by QR followed by an SVD of the small triangular factor, which also reveals the rank. The
-regression is on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small steps.
+squares the condition number: ``regression`` works on the triangle of a QR factorisation, with the
+columns scaled to unit norm, and an SVD of that small triangle reveals the rank. The regression is
+on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small steps.
 """
 
 from collections.abc import Mapping
@@ -13,14 +13,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from kjax import srb
 from kjax.config import KoopmanConfig, SrbConfig
+from kjax.koopman import regression
 from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
+from kjax.koopman.families import BilinearModel
 from kjax.koopman.models import LinearModel
-from kjax.koopman.observables import Dictionary, paper
-from kjax.types import MODE_ALPHA, Mode
+from kjax.koopman.observables import STATE_ROWS, Dictionary, fourier, monomials, paper
+from kjax.types import INPUT_DIM, MODE_ALPHA, STATE_DIM, Mode
 
 Point = tuple[float, float]  # (x, z) [m]
 
@@ -45,72 +47,183 @@ class FitReport(NamedTuple):
     finite: Array
 
 
+def lift_all(
+    dictionary: Dictionary, states: Float[Array, "rollouts steps_plus_1 6"]
+) -> Float[Array, "rollouts T N"]:
+    """Lifted states of all rollouts; with delay coordinates from the first full window on."""
+    if dictionary.window == 1:
+        return jax.vmap(jax.vmap(dictionary.lift))(states)
+    count = states.shape[1] - dictionary.window + 1
+    place = np.arange(count)[:, None] + np.arange(dictionary.window)
+    return jax.vmap(jax.vmap(dictionary.lift))(states[:, place])
+
+
 def regressors(
-    dictionary: Dictionary, data: Snapshots, *, feet_terms: bool
+    dictionary: Dictionary,
+    data: Snapshots,
+    *,
+    feet_terms: bool = False,
+    bilinear: bool = False,
 ) -> tuple[Float[Array, "M columns"], Float[Array, "M N"]]:
-    """Regressor rows ``[Pi(x), u, r (x) u]`` and targets ``Pi(y) - Pi(x)`` of all snapshots."""
-    lifted = jax.vmap(jax.vmap(dictionary.lift))(data.states)
+    """Regressor rows and targets ``Pi(y) - Pi(x)`` of all snapshots.
+
+    The rows are ``[Pi(x), u]``; with ``feet_terms`` ``[Pi(x), u, r (x) u]``, and ``bilinear``
+    ``[Pi(x), Pi(x) (x) u]``, which holds u as the product with the constant.
+    """
+    lifted = lift_all(dictionary, data.states)
     now, then = lifted[:, :-1], lifted[:, 1:]
-    blocks = [now, data.inputs]
+    inputs = data.inputs[:, dictionary.window - 1 :]
+    if bilinear:
+        product = now[..., :, None] * inputs[..., None, :]
+        blocks = [now, product.reshape(*inputs.shape[:2], -1)]
+    else:
+        blocks = [now, inputs]
     if feet_terms:
         # Each end's force meets its own contact point only: (x, z) x (F_x, F_z), front and rear.
-        forces = data.inputs.reshape(*data.inputs.shape[:2], 2, 2)
+        forces = inputs.reshape(*inputs.shape[:2], 2, 2)
         product = data.feet[:, None, :, :, None] * forces[..., None, :]
-        blocks.append(product.reshape(*data.inputs.shape[:2], 8))
+        blocks.append(product.reshape(*inputs.shape[:2], 8))
     Z = jnp.concatenate(blocks, axis=-1)
     return Z.reshape(-1, Z.shape[-1]), (then - now).reshape(-1, now.shape[-1])
 
 
-def least_squares(
-    Z: Float[Array, "M columns"], Y: Float[Array, "M N"]
-) -> tuple[Float[Array, "columns N"], Int[Array, ""], Float[Array, "columns"]]:
-    """Minimum-norm solution W of Z W = Y in the scaled columns, its rank and singular values."""
-    norm = jnp.linalg.norm(Z, axis=0)
-    scale = jnp.where(norm > 0, norm, 1.0)
-    Q, R = jnp.linalg.qr(Z / scale)
-    left, sigma, right = jnp.linalg.svd(R)
-    keep = sigma > sigma[0] * max(Z.shape) * jnp.finfo(Z.dtype).eps
-    inverse = jnp.where(keep, 1.0 / jnp.where(keep, sigma, 1.0), 0.0)
-    W = right.T @ (inverse[:, None] * (left.T @ (Q.T @ Y)))
-    return W / scale[:, None], keep.sum(), sigma
-
-
 def fit(
-    dictionary: Dictionary, data: Snapshots, *, feet_terms: bool = False
+    dictionary: Dictionary,
+    data: Snapshots,
+    *,
+    feet_terms: bool = False,
+    ridge: float | Float[Array, ""] = 0.0,
+    use: Bool[Array, "N"] | None = None,
 ) -> tuple[LinearModel, FitReport]:
-    """Linear model of one contact mode and a report; ``vmap`` it over modes, seeds, ranges.
+    """Linear model of one contact mode and a report; ``vmap`` it over modes, seeds, ranges, ridge.
 
     Args:
       dictionary: observables.
       data: snapshots of that mode.
       feet_terms: fit the dependence of B on the contact points as well (they must vary).
+      ridge: penalty of the weights in scaled columns [-].
+      use: (N,) observables to use: many dictionaries in one ``vmap`` are cuts of a large one.
     """
     N = dictionary.size
     Z, Y = regressors(dictionary, data, feet_terms=feet_terms)
-    W, rank, sigma = least_squares(Z, Y)
-    K = W.T
+    use = None if use is None else jnp.concatenate([use, jnp.ones((Z.shape[1] - N,), bool)])
+    rows = regression.of_rows(Z, Y)
+    weights = regression.solve(rows, Z.shape[1], ridge=ridge, use=use)
+    return linear_model(weights.W, N), _report(rows, weights, Z, Y)
+
+
+def linear_model(W: Float[Array, "columns N"], size: int) -> LinearModel:
+    """The model that weights of ``[Pi(x), u]`` or ``[Pi(x), u, r (x) u]`` stand for."""
+    K, N = W.T, size
     B_feet = jnp.zeros((4, N, 4), K.dtype)
-    if feet_terms:
+    if K.shape[1] > N + 4:
         # (end, coordinate, force) -> column of u: front forces are 0 and 1, rear ones 2 and 3.
         products = K[:, N + 4 :].reshape(N, 2, 2, 2)
         B_feet = B_feet.at[0:2, :, 0:2].set(jnp.moveaxis(products[:, 0], 1, 0))
         B_feet = B_feet.at[2:4, :, 2:4].set(jnp.moveaxis(products[:, 1], 1, 0))
-    model = LinearModel(A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=K[:, N : N + 4], B_feet=B_feet)
-    residual = (Y - Z @ W)[:, 1:7]
+    return LinearModel(A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=K[:, N : N + 4], B_feet=B_feet)
+
+
+def fit_bilinear(
+    dictionary: Dictionary, data: Snapshots, *, ridge: float | Float[Array, ""] = 0.0
+) -> tuple[BilinearModel, FitReport]:
+    """Bilinear model Pi(y) = A Pi(x) + sum_i Pi_i(x) B_i u of one contact mode, and a report."""
+    N = dictionary.size
+    Z, Y = regressors(dictionary, data, bilinear=True)
+    rows = regression.of_rows(Z, Y)
+    weights = regression.solve(rows, Z.shape[1], ridge=ridge)
+    K = weights.W.T
+    B = jnp.moveaxis(K[:, N:].reshape(N, N, 4), 1, 0)
+    return BilinearModel(A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=B), _report(rows, weights, Z, Y)
+
+
+def _report(
+    rows: regression.Triangle, weights: regression.Weights, Z: Array, Y: Array
+) -> FitReport:
+    sigma, rank = weights.sigma, weights.rank
     smallest = jnp.min(jnp.where(jnp.arange(sigma.shape[0]) < rank, sigma, jnp.inf))
-    report = FitReport(
+    return FitReport(
         rank=rank,
         columns=jnp.asarray(Z.shape[1]),
         condition=sigma[0] / smallest,
         condition_full=sigma[0] / sigma[-1],
-        residual_rms=jnp.sqrt(jnp.mean(residual**2, axis=0)),
-        finite=jnp.isfinite(Z).all() & jnp.isfinite(Y).all() & jnp.isfinite(W).all(),
+        residual_rms=regression.rms(rows, weights.W)[STATE_ROWS],
+        finite=jnp.isfinite(Z).all() & jnp.isfinite(Y).all() & jnp.isfinite(weights.W).all(),
     )
-    return model, report
+
+
+def check_snapshots(
+    data: Snapshots, dictionary: Dictionary, *, dt: float, columns: int | None = None
+) -> list[str]:
+    """Look at the data before a fit, on the host.
+
+    Args:
+      data: snapshots of one mode.
+      dictionary: observables.
+      dt: step between the states [s].
+      columns: number of regressors; that of the linear model if ``None``.
+
+    Returns:
+      Remarks that are no errors: observables that do not vary.
+
+    Raises:
+      ValueError: for wrong shapes, numbers that are not finite, fewer snapshots than regressors,
+        and for a rollout whose positions do not follow from its velocities, as where two episodes
+        were put into one.
+    """
+    states, inputs = (np.asarray(a) for a in (data.states, data.inputs))
+    if states.ndim != 3 or states.shape[-1] != STATE_DIM:
+        raise ValueError(f"states: got shape {states.shape}, wanted (rollouts, steps + 1, 6)")
+    wanted = (states.shape[0], states.shape[1] - 1, INPUT_DIM)
+    if inputs.shape != wanted:
+        raise ValueError(f"inputs: got shape {inputs.shape}, wanted {wanted} for these states")
+    if np.shape(data.feet) != (states.shape[0], 2, 2):
+        raise ValueError(f"feet: got shape {np.shape(data.feet)}, wanted ({len(states)}, 2, 2)")
+    for name, values in (("states", states), ("inputs", inputs), ("feet", np.asarray(data.feet))):
+        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        if bad.any():
+            raise ValueError(
+                f"{name}: {int(bad.sum())} of {len(bad)} rollouts hold numbers that are not "
+                f"finite, the first one is rollout {int(np.argmax(bad))}"
+            )
+    rows = states.shape[0] * (states.shape[1] - dictionary.window)
+    columns = dictionary.size + INPUT_DIM if columns is None else columns
+    if rows < columns:
+        raise ValueError(f"{rows} snapshots are too few for {columns} regressors")
+    moved = np.diff(states[..., :3], axis=1)
+    drift = np.abs(moved - dt * 0.5 * (states[:, 1:, 3:] + states[:, :-1, 3:])).max(axis=2)
+    # Half a step's change of velocity is the largest miss that a smooth motion has.
+    change = np.abs(np.diff(states[..., 3:], axis=1)).max(axis=2)
+    jump = drift > dt * (change + 1.0) + 1e-3
+    if jump.any():
+        rollout, step = np.argwhere(jump)[0]
+        raise ValueError(
+            f"states: rollout {rollout} jumps by {drift[rollout, step]:.3g} between steps {step} "
+            f"and {step + 1}, which its velocity does not explain: are there two episodes in it, "
+            f"or is dt {dt} s not its step?"
+        )
+    lifted = np.asarray(lift_all(dictionary, jnp.asarray(states))).reshape(-1, dictionary.size)
+    spread = np.ptp(lifted, axis=0)
+    still = spread <= 1e-9 * np.maximum(np.abs(lifted).max(axis=0), 1e-30)
+    return [
+        f"observable '{dictionary.names[i]}' does not vary in the data: it counts as a constant"
+        for i in np.flatnonzero(still)
+        if i > 0
+    ]
+
+
+def spectrum(A: Float[np.ndarray, "N N"], dt: float) -> np.ndarray:
+    """Eigenvalues of the transition as rates log(lambda) / dt [1/s], fastest growing first."""
+    rates = np.log(np.linalg.eigvals(np.asarray(A, np.float64)).astype(complex)) / dt
+    return rates[np.argsort(-rates.real)]
 
 
 def build_dictionary(config: KoopmanConfig) -> Dictionary:
     """The dictionary that a config names."""
+    if config.dictionary == "monomials":
+        return monomials(config.order)
+    if config.dictionary == "fourier":
+        return fourier(config.fourier_count, scale=config.fourier_scale, seed=config.fourier_seed)
     return paper(
         config.order,
         literal=config.dictionary == "paper_literal",

@@ -1,0 +1,118 @@
+"""Least squares Z W = Y as a triangle that data runs through: stable, mergeable, of bounded size.
+
+The triangle is R of the QR factorisation of [Z Y]. It holds all that the fit, its residual and its
+rank need, it does not square the condition number as a Gram matrix does, and QR of two stacked
+triangles is the triangle of all their rows: snapshots may come in blocks, from several machines, or
+one by one as the robot walks (with forgetting), and 10^8 of them need no more memory than ten.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Triangle(NamedTuple):
+    """Everything that least squares needs of M rows [Z Y], c + t columns.
+
+    Attributes:
+      R: (c + t, c + t) upper triangle with R^T R = [Z Y]^T [Z Y].
+      count: number of rows, fewer where old ones were forgotten.
+    """
+
+    R: Float[Array, "ct ct"]
+    count: Float[Array, ""]
+
+
+class Weights(NamedTuple):
+    """Solution of a least-squares problem.
+
+    Attributes:
+      W: (c, t) with Z W = Y.
+      rank: numerical rank of the scaled columns.
+      sigma: (c,) their singular values, largest first [-].
+    """
+
+    W: Float[Array, "c t"]
+    rank: Int[Array, ""]
+    sigma: Float[Array, "c"]
+
+
+def empty(columns: int, targets: int, dtype: jnp.dtype | None = None) -> Triangle:
+    """The triangle of no rows."""
+    size = columns + targets
+    return Triangle(R=jnp.zeros((size, size), dtype), count=jnp.zeros((), dtype))
+
+
+def accumulate(
+    triangle: Triangle,
+    Z: Float[Array, "M c"],
+    Y: Float[Array, "M t"],
+    *,
+    forget: float | Float[Array, ""] = 1.0,
+) -> Triangle:
+    """The triangle with M rows more; all older rows first lose weight by ``forget`` (0 to 1]."""
+    rows = jnp.concatenate([Z, Y], axis=1)
+    old = jnp.sqrt(jnp.asarray(forget, rows.dtype)) * triangle.R
+    R = jnp.linalg.qr(jnp.concatenate([old, rows]), mode="r")
+    return Triangle(R=R[: old.shape[0]], count=forget * triangle.count + rows.shape[0])
+
+
+def merge(one: Triangle, other: Triangle) -> Triangle:
+    """The triangle of the rows of both."""
+    R = jnp.linalg.qr(jnp.concatenate([one.R, other.R]), mode="r")
+    return Triangle(R=R, count=one.count + other.count)
+
+
+def of_rows(Z: Float[Array, "M c"], Y: Float[Array, "M t"]) -> Triangle:
+    """The triangle of M rows, fewer than columns or more."""
+    size = Z.shape[1] + Y.shape[1]
+    R = jnp.linalg.qr(jnp.concatenate([Z, Y], axis=1), mode="r")
+    R = jnp.zeros((size, size), R.dtype).at[: R.shape[0]].set(R[:size])
+    return Triangle(R=R, count=jnp.asarray(Z.shape[0], R.dtype))
+
+
+def solve(
+    triangle: Triangle,
+    columns: int,
+    *,
+    ridge: float | Float[Array, ""] = 0.0,
+    use: Bool[Array, "c"] | None = None,
+) -> Weights:
+    """Minimum-norm solution in the scaled columns.
+
+    Args:
+      triangle: of the rows.
+      columns: number c of regressors.
+      ridge: penalty of |W|^2 in the scaled columns (each of unit length), 0 for none [-].
+      use: (c,) regressors to use, a dictionary cut out of a larger one; all if ``None``.
+    """
+    R, Y = triangle.R[:columns, :columns], triangle.R[:columns, columns:]
+    if use is not None:
+        R = jnp.where(use, R, 0.0)
+    norm = jnp.linalg.norm(R, axis=0)
+    scale = jnp.where(norm > 0, norm, 1.0)
+    left, sigma, right = jnp.linalg.svd(R / scale)
+    size = jnp.maximum(triangle.count, columns)
+    keep = sigma > sigma[0] * size * jnp.finfo(R.dtype).eps
+    safe = jnp.where(keep, sigma, 1.0)
+    gain = jnp.where(keep, safe / (safe**2 + ridge), 0.0)
+    W = right.T @ (gain[:, None] * (left.T @ Y))
+    return Weights(W=W / scale[:, None], rank=keep.sum(), sigma=sigma)
+
+
+def rms(triangle: Triangle, W: Float[Array, "c t"]) -> Float[Array, "t"]:
+    """Root mean square of Y - Z W over the triangle's rows; these need not be those of the fit."""
+    move = jnp.concatenate([-W, jnp.eye(W.shape[1], dtype=W.dtype)])
+    size = jnp.maximum(triangle.count, 1.0)
+    return jnp.linalg.norm(triangle.R @ move, axis=0) / jnp.sqrt(size)
+
+
+def block_rows(triangle: Triangle, Z: Float[Array, "B M c"], Y: Float[Array, "B M t"]) -> Triangle:
+    """B blocks of rows one after the other: the memory of one block."""
+
+    def one(triangle: Triangle, block: tuple[Array, Array]) -> tuple[Triangle, None]:
+        return accumulate(triangle, *block), None
+
+    return jax.lax.scan(one, triangle, (Z, Y))[0]
