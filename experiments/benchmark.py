@@ -6,6 +6,8 @@ qp: the QP solvers on the QPs of closed loops, beside daqp, quadprog, OSQP, Prox
 qpSWIFT and qpax, as far as these are installed; single, in a scan and batched.
 simulation: closed loops per second on C MuJoCo and on MJX against the number of robots, beside the
 bare engines and a Python loop over single robots; compile time, memory, two processes against one.
+edmd: fits beside pykoopman and pykoop, the drawing of their data beside NumPy, 10^7 snapshots in a
+stream; --peers names a Python that has the two.
 """
 
 import json
@@ -18,6 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import edmd_benchmark
 import jax
 import mujoco
 import numpy as np
@@ -30,7 +33,7 @@ from kjax.sim.episode import initial_state, metrics
 from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
 from kjax.sim.observe import noise_dim
 
-STUDIES = {"qp": qp_benchmark, "simulation": simulation_benchmark}
+STUDIES = {"qp": qp_benchmark, "simulation": simulation_benchmark, "edmd": edmd_benchmark}
 BENCHMARKS = ("controller", *STUDIES)
 CALLS = 2000  # timed calls of each function
 WALK = 400  # ms of walking from which the timed inputs are taken
@@ -74,7 +77,7 @@ def study(name: str, words: list[str]) -> None:
     args.out = args.out or Path("results") / f"benchmark_{name}"
     args.config = None
     folder = cli.output_folder(args, f"benchmark_{name}")
-    cli.configure_jax(one_core=name == "qp")
+    cli.configure_jax(one_core=name in ("qp", "edmd"))
     result = module.run(folder, args)
     cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
     print((folder / "table.md").read_text(encoding="utf-8"))

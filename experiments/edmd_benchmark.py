@@ -1,0 +1,509 @@
+"""EDMD beside pykoopman, pykoop and NumPy: fits, their data, a stream; run by benchmark.py edmd.
+
+The peers need an interpreter of their own, which ``edmd_peers.py`` runs in: three rounds of it with
+rounds of ours in between. Everything runs on one core with one thread.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from tqdm import tqdm
+
+from kjax import cli, srb
+from kjax.config import KoopmanConfig, SrbConfig
+from kjax.koopman import edmd, models, observables, regression
+from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
+from kjax.types import GRAVITY, MODE_ALPHA, STATE_NAMES, Mode
+
+PEERS = ("pykoopman", "pykoop")
+SCRIPT = Path(__file__).with_name("edmd_peers.py")
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+ROUNDS = 3  # of every timing, in turn with those beside it; medians over all calls are reported
+CALLS = 30  # timed fits in a round
+SEEDS = 10
+# (order, with the constant rotation): the paper's first, all of them cuts of the largest.
+DICTIONARIES = tuple((order, constant) for order in (4, 3, 2, 1, 0) for constant in (False, True))
+LARGEST = observables.paper(4, constant_rotation=True)
+PAPER = observables.paper(4)
+
+KEYS = ("fit_ms", "regression_ms", "many_s", "many_lifted_s")
+
+TEST_ROLLOUTS, TEST_STEPS = 100, 50  # held out
+VELOCITIES = slice(3, 6)
+
+ROLLOUTS = 10_000  # whose generation is timed
+LOOP = 20  # of them in the loop over rollouts and steps; the rest by proportion
+
+STREAM = 10_000_000  # snapshots
+BLOCK = 500  # of them in one QR
+
+
+class Setting(NamedTuple):
+    """What the data is drawn from: the trot of the Go1's rigid body in the default ranges."""
+
+    body: srb.SrbParams
+    alpha: jax.Array
+    ranges: SampleRanges
+    rollouts: int
+    steps: int
+    dt: float
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument(
+        "--peers",
+        metavar="PYTHON",
+        help="interpreter of an environment with pykoopman and pykoop; without it, none of them",
+    )
+
+
+def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """All measurements; leaves figure.png and table.md in the folder."""
+    versions = peer_versions(args.peers) if args.peers else {}
+    _one_thread()
+    missing = [name for name in PEERS if name not in versions]
+    if missing:
+        print(f"left out: {', '.join(missing)} (--peers names the Python that has them)")
+    quick, here = args.quick, setting()
+    result: dict[str, Any] = {"peers": versions, "missing": missing}
+    # First, while the largest memory that this process ever had is still that of its imports.
+    print("stream of snapshots")
+    result["stream"] = stream(here, STREAM // 100 if quick else STREAM)
+    print("fits")
+    result["fits"] = fits(here, args.peers, versions, 5 if quick else CALLS)
+    print("rollouts")
+    result["rollouts"] = rollouts(here, ROLLOUTS // 10 if quick else ROLLOUTS, LOOP)
+    result |= summary(result)
+    (folder / "table.md").write_text(table(result), encoding="utf-8")
+    figure(result, folder / "figure.png")
+    return result
+
+
+def summary(result: dict[str, Any]) -> dict[str, Any]:
+    """The figures that matter; None where a peer is absent."""
+    found, data = result["fits"], result["rollouts"]
+
+    def ratio(peer: str) -> float | None:
+        return found["fit_ms"]["kjax"] / found["fit_ms"][peer] if peer in found["fit_ms"] else None
+
+    def speedup(key: str) -> float | None:
+        rivals = [seconds for name, seconds in found[key].items() if name != "kjax"]
+        return min(rivals) / found[key]["kjax"] if rivals else None
+
+    return {
+        "fit_over_pykoopman": ratio("pykoopman"),
+        "fit_over_pykoop": ratio("pykoop"),
+        "fits100_speedup": speedup("many_s"),
+        "fits100_speedup_lifted_once": speedup("many_lifted_s"),
+        "rollouts_speedup": data["kjax"] / data["numpy_loop"],
+        "rollouts_over_vectorised_numpy": data["kjax"] / data["numpy_vectorised"],
+        "streaming_snapshots_per_s": result["stream"]["snapshots_per_s"],
+    }
+
+
+def setting() -> Setting:
+    """Trot, Go1, and the ranges that the controller's models are fitted on."""
+    config = KoopmanConfig().dataset
+    return Setting(
+        body=jax.tree.map(lambda leaf: leaf[Mode.TROT], edmd.srb_params(SrbConfig())),
+        alpha=jnp.asarray(MODE_ALPHA[Mode.TROT], float),
+        ranges=ranges_from_config(config, vary_feet=False),
+        rollouts=config.rollouts,
+        steps=round(config.duration / config.dt),
+        dt=config.dt,
+    )
+
+
+def sampler(here: Setting, rollouts: int, steps: int) -> Callable[[jax.Array], Snapshots]:
+    """Compiled draw of rollouts from a random key."""
+    return jax.jit(
+        lambda key: sample(
+            key, here.body, here.alpha, here.ranges, rollouts=rollouts, steps=steps, dt=here.dt
+        )
+    )
+
+
+def _one_thread() -> None:
+    """Start this program anew with one thread for linear algebra, unless it was started so.
+
+    OpenBLAS reads the number when it is loaded, which is before the first line of ours.
+    """
+    if any(os.environ.get(name) != "1" for name in THREADS):
+        sys.stdout.flush()
+        environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
+
+
+def _timed(call: Callable[[], Any]) -> float:
+    clock = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - clock
+
+
+# ---------------------------------------------------------------- fits
+
+
+def fits(here: Setting, python: str | None, versions: Any, calls: int) -> dict[str, Any]:
+    """One fit and a hundred of them, in time and error; one median per solver and quantity.
+
+    Returns:
+      ``fit_ms`` from states and ``regression_ms`` from lifted states; ``many_s`` for all data sets
+      with all dictionaries, ``many_lifted_s`` the same where each data set is lifted once, in the
+      largest dictionary; ``error`` with the largest and the root-mean-square error of each velocity
+      after the test rollouts [m/s, rad/s]; ``many_timed``, how many of a peer's fits were timed.
+    """
+    keys = jax.random.split(jax.random.key(KoopmanConfig().dataset.seed), SEEDS + 1)
+    data = jax.lax.map(sampler(here, here.rollouts, here.steps), keys[1:])
+    test = sampler(here, TEST_ROLLOUTS, TEST_STEPS)(keys[0])
+    first = jax.tree.map(lambda leaf: leaf[0], data)
+    fit, regress = jax.jit(partial(edmd.fit, PAPER)), jax.jit(_regress)
+    rows = jax.jit(partial(edmd.regressors, PAPER))(first)
+    ours: dict[str, tuple[Callable[[], Any], int, float]] = {
+        "fit_ms": (lambda: fit(first), calls, 1e3),
+        "regression_ms": (lambda: regress(*rows), calls, 1e3),
+        "many_s": (lambda: many(data), 3, 1.0),
+    }
+    for call, _, _ in ours.values():
+        jax.block_until_ready(call())
+    times: dict[str, dict[str, list[float]]] = {key: {"kjax": []} for key in KEYS}
+    ends = {"kjax": np.asarray(predict(fit(first)[0], test))}
+    done = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "data.npz"
+        np.savez(path, states=data.states, inputs=data.inputs, test_states=test.states,
+                 test_inputs=test.inputs, dictionaries=DICTIONARIES, calls=calls)  # fmt: skip
+        for _ in tqdm(range(ROUNDS), desc="rounds", leave=False, disable=None):
+            for key, (call, count, unit) in ours.items():
+                times[key]["kjax"] += [unit * _timed(call) for _ in range(count)]
+            times["many_lifted_s"]["kjax"] = times["many_s"]["kjax"]  # it lifts once as it is
+            for name, entry in (_peers(python, path) if versions else {}).items():
+                for key in KEYS:
+                    values = entry[key] if isinstance(entry[key], list) else [entry[key]]
+                    times[key].setdefault(name, []).extend(values)
+                ends[name] = np.asarray(entry["end"])
+                done[name] = min(entry["many_done"], done.get(name, len(DICTIONARIES) * SEEDS))
+    result: dict[str, Any] = {
+        key: {name: float(np.median(values)) for name, values in entry.items()}
+        for key, entry in times.items()
+    }
+    truth = np.asarray(test.states[:, -1])
+    result["error"] = {
+        name: {
+            "max": np.abs(end - truth).max(axis=0)[VELOCITIES],
+            "rms": np.sqrt(((end - truth) ** 2).mean(axis=0))[VELOCITIES],
+        }
+        for name, end in ends.items()
+    }
+    result["many_timed"] = done
+    return result
+
+
+def cuts() -> np.ndarray:
+    """Observables (dictionaries, N) of the largest dictionary that each of the others uses."""
+    smaller = (observables.paper(order, constant_rotation=c) for order, c in DICTIONARIES)
+    return np.array([[name in one.names for name in LARGEST.names] for one in smaller])
+
+
+@jax.jit
+def many(data: Snapshots) -> Any:
+    """Models and reports of all data sets (leading axis) in all dictionaries."""
+    use = jnp.asarray(cuts())
+
+    def one(data: Snapshots) -> Any:
+        return jax.vmap(lambda use: edmd.fit(LARGEST, data, use=use))(use)
+
+    return jax.lax.map(one, data)  # one after the other: ten data sets at once leave the cache
+
+
+def _regress(Z: jax.Array, Y: jax.Array) -> regression.Weights:
+    return regression.solve(regression.of_rows(Z, Y), Z.shape[1])
+
+
+@jax.jit
+def predict(model: models.LinearModel, test: Snapshots) -> jax.Array:
+    """States (rollouts, 6) at the end of the test rollouts, lifted once at their start."""
+
+    def one(states: jax.Array, inputs: jax.Array, feet: jax.Array) -> jax.Array:
+        return models.rollout(model, PAPER.lift(states[0]), inputs, feet)[-1]
+
+    return jax.vmap(one)(*test)
+
+
+def peer_versions(python: str) -> dict[str, str]:
+    """Versions of the peers that an interpreter has; ends the program where it has none."""
+    try:
+        done = subprocess.run([python, str(SCRIPT)], capture_output=True, text=True, check=False)
+        versions = json.loads(done.stdout)
+    except OSError as error:
+        cli.fail(f"--peers {python}: {error.strerror}")
+    except json.JSONDecodeError:
+        cli.fail(f"--peers {python}: this is no Python that can run {SCRIPT.name}")
+    if not versions:
+        cli.fail(f"--peers {python}: it has neither of {', '.join(PEERS)}")
+    return versions
+
+
+def _peers(python: str | None, data: Path) -> dict[str, Any]:
+    """One round of the peers, on the core that this process is bound to."""
+    out = data.with_name("out.json")
+    command = [str(python), str(SCRIPT), str(data), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        cli.fail(f"--peers {python}: {(done.stderr.strip() or 'it failed').splitlines()[-1]}")
+    return json.loads(out.read_text(encoding="utf-8"))
+
+
+# ---------------------------------------------------------------- rollouts
+
+
+def rollouts(here: Setting, count: int, looped: int) -> dict[str, float]:
+    """Rollouts per second, random numbers included: kjax, a NumPy loop, vectorised NumPy."""
+    draw, key, rng = sampler(here, count, here.steps), jax.random.key(0), np.random.default_rng(0)
+    body, alpha = jax.tree.map(np.asarray, here.body), np.asarray(here.alpha)
+    calls = {
+        "kjax": (lambda: draw(key), count),
+        "numpy_vectorised": (
+            lambda: numpy_rollouts(body, alpha, *numpy_draw(rng, here, count), here.dt),
+            count,
+        ),
+        "numpy_loop": (
+            lambda: numpy_loop(body, alpha, *numpy_draw(rng, here, looped), here.dt),
+            looped,
+        ),
+    }
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for round_ in range(2 * ROUNDS + 1):  # the first one warms up
+        for name, (call, number) in calls.items():
+            spent = _timed(call)
+            if round_:
+                times[name].append(spent / number)
+    return {name: 1.0 / float(np.median(values)) for name, values in times.items()}
+
+
+def numpy_draw(rng: np.random.Generator, here: Setting, count: int) -> tuple[np.ndarray, ...]:
+    """Initial states (count, 6) and forces (count, steps, 4) in the ranges of the setting."""
+    ranges = jax.tree.map(np.asarray, here.ranges)
+    x0 = ranges.state_centre + ranges.state_half * rng.uniform(-1.0, 1.0, (count, 6))
+    return x0, rng.uniform(ranges.input_low, ranges.input_high, (count, here.steps, 4))
+
+
+def numpy_rollouts(
+    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
+) -> np.ndarray:
+    """Trajectories (rollouts, steps + 1, 6): all rollouts at once, by Runge-Kutta.
+
+    As fast as plain NumPy has it: states in rows, what the step does not change taken once.
+    """
+    states = np.empty((inputs.shape[1] + 1, 6, len(x0)))
+    states[0] = x0.T
+    forces = np.ascontiguousarray(inputs.transpose(1, 2, 0)) * np.repeat(alpha, 2)[:, None]
+    for t, (x_front, z_front, x_rear, z_rear) in enumerate(forces):
+        force_x, force_z = (x_front + x_rear) / body.mass, (z_front + z_rear) / body.mass
+        (x_f, z_f), (x_r, z_r) = body.feet
+        moment = x_f * z_front - z_f * x_front + x_r * z_rear - z_r * x_rear
+        turn = moment / body.inertia
+        derivative = partial(_derivative, force_x, force_z, turn)
+        states[t + 1] = _rk4(derivative, states[t], dt)
+    return states.transpose(2, 0, 1)
+
+
+def _rk4(derivative: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: float) -> np.ndarray:
+    k1 = derivative(x)
+    k2 = derivative(x + 0.5 * dt * k1)
+    k3 = derivative(x + 0.5 * dt * k2)
+    k4 = derivative(x + dt * k3)
+    return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+def _derivative(
+    force_x: np.ndarray, force_z: np.ndarray, turn: np.ndarray, x: np.ndarray
+) -> np.ndarray:
+    """Derivative (6, rollouts); forces per mass [m/s^2] in the body frame, turn [rad/s^2]."""
+    out = np.empty_like(x)
+    c, s = np.cos(x[2]), np.sin(x[2])
+    out[:3] = x[3:]
+    out[3] = c * force_x - s * force_z
+    out[4] = s * force_x + c * force_z - GRAVITY
+    out[5] = turn
+    return out
+
+
+def numpy_loop(
+    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
+) -> np.ndarray:
+    """The same, one rollout and one step after the other."""
+    states = np.empty((len(x0), inputs.shape[1] + 1, 6))
+    states[:, 0] = x0
+    for path, forces in zip(states, inputs, strict=True):
+        for t, u in enumerate(forces):
+            force = alpha[:, None] * u.reshape(2, 2)
+            total = force.sum(axis=0) / body.mass
+            arm = body.feet
+            moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum()
+            derivative = partial(_derivative, total[0], total[1], moment / body.inertia)
+            path[t + 1] = _rk4(derivative, path[t], dt)
+    return states
+
+
+# ---------------------------------------------------------------- stream
+
+
+def stream(here: Setting, total: int) -> dict[str, float]:
+    """Snapshots through the triangle, drawn as they are needed and forgotten; none is kept.
+
+    Returns:
+      Snapshots per second into the triangle (lifting included), and with their drawing; peak
+      memory over that before the first one [MB], compiled programs included, and growth after the
+      first hundredth [MB]; what all rows would take [MB]; the largest difference between the
+      coefficients of the first blocks and of one factorisation of the same rows, relative to the
+      largest coefficient, in scaled columns.
+    """
+    before = _resident()
+    draw, size = sampler(here, here.rollouts, here.steps), here.rollouts * here.steps
+    pushes = max(1, total // size)
+    kept: list[Snapshots] = []
+    triangle, part = empty_triangle(), empty_triangle()
+    jax.block_until_ready(push(triangle, draw(jax.random.key(1))))
+    pushing, drawing, early = 0.0, 0.0, 0.0
+    for i in tqdm(range(pushes), desc="stream", leave=False, disable=None):
+        clock = time.perf_counter()
+        data = jax.block_until_ready(draw(jax.random.fold_in(jax.random.key(0), i)))
+        middle = time.perf_counter()
+        triangle = jax.block_until_ready(push(triangle, data))
+        pushing += time.perf_counter() - middle
+        drawing += middle - clock
+        if i < 10:
+            kept.append(data)
+            part = triangle
+        if i == max(9, pushes // 100):
+            early = _resident()
+    peak = _resident()
+    columns = triangle.R.shape[0]
+    return {
+        "snapshots": pushes * size,
+        "snapshots_per_s": pushes * size / pushing,
+        "snapshots_per_s_with_drawing": pushes * size / (pushing + drawing),
+        "peak_MB": peak - before,
+        "growth_MB": peak - early,
+        "all_rows_MB": pushes * size * columns * triangle.R.dtype.itemsize / 1e6,
+        "coefficients_difference": difference_from_one_shot(part, kept),
+    }
+
+
+def empty_triangle() -> regression.Triangle:
+    """The triangle of the paper's dictionary and four forces, of no rows."""
+    return regression.empty(PAPER.size + 4, PAPER.size)
+
+
+@jax.jit
+def push(triangle: regression.Triangle, data: Snapshots) -> regression.Triangle:
+    """The triangle with the snapshots more, in blocks of ``BLOCK`` rows."""
+    Z, Y = edmd.regressors(PAPER, data)
+    whole = len(Z) // BLOCK * BLOCK
+    blocks = (a[:whole].reshape(-1, BLOCK, a.shape[1]) for a in (Z, Y))
+    triangle = regression.block_rows(triangle, *blocks)
+    return regression.accumulate(triangle, Z[whole:], Y[whole:]) if whole < len(Z) else triangle
+
+
+def difference_from_one_shot(triangle: regression.Triangle, data: Sequence[Snapshots]) -> float:
+    """Largest difference of the coefficients, relative to the largest, in scaled columns."""
+    together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *data)
+    columns = PAPER.size + 4
+    rows = jax.jit(lambda data: regression.of_rows(*edmd.regressors(PAPER, data)))(together)
+    solve = jax.jit(partial(regression.solve, columns=columns))
+    scale = np.linalg.norm(np.asarray(rows.R)[:, :columns], axis=0)[:, None]
+    wanted, found = (scale * np.asarray(solve(one).W) for one in (rows, triangle))
+    return float(np.abs(found - wanted).max() / np.abs(wanted).max())
+
+
+def _resident() -> float:
+    """Largest resident memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+# ---------------------------------------------------------------- presentation
+
+
+def table(result: dict[str, Any]) -> str:
+    """All of it as Markdown."""
+    found, data, flow = result["fits"], result["rollouts"], result["stream"]
+    names = list(found["fit_ms"])
+    titles = [f"{name} {result['peers'].get(name, '')}".strip() for name in names]
+    lines = [f"| one fit, {PAPER.size} observables | {' | '.join(titles)} |",
+             "|---" * (len(names) + 1) + "|"]  # fmt: skip
+    for key, title, unit in (
+        ("fit_ms", "10,000 snapshots, from states", "ms"),
+        ("regression_ms", "the regression alone, from lifted states", "ms"),
+        ("many_s", "100 fits, from states", "s"),
+        ("many_lifted_s", "100 fits, each data set lifted once", "s"),
+    ):
+        values = " | ".join(f"{found[key][name]:.3g} {unit}" for name in names)
+        lines.append(f"| {title} | {values} |")
+    for i, velocity in enumerate(STATE_NAMES[VELOCITIES]):
+        values = " | ".join(f"{found['error'][name]['max'][i]:.2e}" for name in names)
+        unit = "rad/s" if velocity == "omega" else "m/s"
+        lines.append(f"| largest error of {velocity} after 50 ms [{unit}] | {values} |")
+    if result["missing"]:
+        lines.append(f"\nNot measured: {', '.join(result['missing'])}.")
+    part = {name: n for name, n in found["many_timed"].items() if n < len(DICTIONARIES) * SEEDS}
+    for name, number in part.items():
+        lines.append(f"\nOf the 100 fits of {name}, {number} were timed; the rest by proportion.")
+    lines += ["", "| rollouts of 100 steps | per second |", "|---|---|"]
+    for name, title in (
+        ("kjax", "kjax, one compiled call"),
+        ("numpy_vectorised", "NumPy, vectorised over rollouts"),
+        ("numpy_loop", f"NumPy, rollout by rollout and step by step ({LOOP} timed)"),
+    ):
+        lines.append(f"| {title} | {data[name]:,.0f} |")
+    lines += [
+        "",
+        f"| stream of {flow['snapshots']:,} snapshots | |",
+        "|---|---|",
+        f"| lifted and into the triangle | {flow['snapshots_per_s']:,.0f} per second |",
+        f"| with their drawing | {flow['snapshots_per_s_with_drawing']:,.0f} per second |",
+        f"| peak memory, programs included | {flow['peak_MB']:.0f} MB |",
+        f"| of it after the first hundredth | {flow['growth_MB']:.0f} MB |",
+        f"| what all rows would take | {flow['all_rows_MB']:,.0f} MB |",
+        f"| coefficients, relative to one factorisation | {flow['coefficients_difference']:.1e} |",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Times of the fits and rates of the rollouts."""
+    fig, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
+    found, data = result["fits"], result["rollouts"]
+    panels = (
+        ("fit_ms", "regression_ms", "regression alone", "one fit, 10,000 snapshots", "ms"),
+        ("many_s", "many_lifted_s", "lifted once", "10 data sets x 10 dictionaries", "s"),
+    )
+    for ax, (*keys, label, title, unit) in zip(axes[:2], panels, strict=True):
+        labels = ("from states", label)
+        names = list(found[keys[0]])
+        place = np.arange(len(names))
+        for i, (key, label) in enumerate(zip(keys, labels, strict=True)):
+            ax.bar(place + 0.4 * i - 0.2, [found[key][n] for n in names], 0.4, label=label)
+        ax.set_xticks(place, names)
+        ax.set(title=title, ylabel=f"time [{unit}]")
+        ax.legend(fontsize=8)
+    labels = ("kjax", "NumPy,\nvectorised", "NumPy,\nloop")
+    axes[2].bar(labels, [data[n] for n in ("kjax", "numpy_vectorised", "numpy_loop")])
+    axes[2].set(title="data: rollouts of 100 steps", ylabel="rollouts per second", yscale="log")
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
