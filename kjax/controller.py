@@ -114,6 +114,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
     sim_dt = config.sim.sim_dt
     base = build_base(config.sim.base)
     plan_forces = build_planner(config) if planner is None else planner
+    hessians_stay = config.koopman.feet == "fixed" and config.koopman.model == "linear"
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
         observation = _cast(observation, params)
@@ -129,7 +130,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
             ground=zero,
             velocity=zero,
             correction=jnp.zeros((2,), zero.dtype),
-            memory=start_memory(params.tables, lmpc, carry=config.koopman.feet == "fixed"),
+            memory=start_memory(params.tables, lmpc, carry=hessians_stay),
             force=jnp.zeros((4, 2), zero.dtype),
             swing=swing.initial_swing(view.feet),
             track=track,

@@ -11,6 +11,7 @@ from kjax import gait
 from kjax.config import RunConfig
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import fit_modes, srb_params
+from kjax.koopman.prediction import Prediction, build_prediction
 from kjax.legs import lateral, swing
 from kjax.mpc import multiphase
 from kjax.mpc.lmpc import LmpcTables, build_tables, mode_settings
@@ -23,6 +24,9 @@ class ControllerParams(NamedTuple):
     Attributes:
       robot: geometry and masses.
       tables: LMPC per contact mode.
+      prediction: numbers of the prediction model, linearised on line; ``None`` for the linear EDMD
+        model, which lies in the tables.
+      feet: (M, 2, 2) nominal contact points (front, rear) of every mode, body frame [m].
       schedule: gaits.
       gait_times: (K,) times at which a gait is asked for, the first one 0 [s].
       gaits: (K,) index of the gait asked for then.
@@ -42,6 +46,8 @@ class ControllerParams(NamedTuple):
 
     robot: RobotParams
     tables: LmpcTables
+    prediction: Prediction | None
+    feet: Float[Array, "M 2 2"]
     schedule: gait.Schedule
     gait_times: Float[Array, "K"]
     gaits: Int[Array, "K"]
@@ -80,6 +86,9 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
         model, report = _fit_modes(body, config.koopman, key)
         if not bool(report.finite.all()):
             raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
+        prediction = None
+        if config.koopman.model != "linear":
+            prediction = build_prediction(body, config.koopman, key, height=config.lmpc.height)
         params = ControllerParams(
             robot=robot,
             tables=_build_tables(
@@ -88,7 +97,11 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
                 steps=round(config.lmpc.model_dt / config.koopman.dataset.dt),
                 horizon=config.lmpc.horizon,
                 feet=body.feet,
+                spread=report.residual_rms if prediction is None else prediction.spread,
+                caution=config.lmpc.caution,
             ),
+            prediction=prediction,
+            feet=body.feet,
             schedule=gait.build_schedule(gaits),
             gait_times=jnp.asarray(config.gait.times),
             gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
@@ -134,7 +147,7 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
 
 
 _fit_modes = jax.jit(fit_modes, static_argnames="config")
-_build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon"))
+_build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon", "caution"))
 
 
 def build_gaits(config: RunConfig) -> list[gait.Gait]:

@@ -14,7 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kjax import gait, qp
 from kjax.config import RunConfig
-from kjax.koopman.edmd import build_dictionary
+from kjax.koopman.families import Start, operating_point
+from kjax.koopman.models import LinearModel, input_map
+from kjax.koopman.prediction import build_family
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc import multiphase
 from kjax.mpc.limits import force_limits
@@ -96,9 +98,26 @@ def build_planner(config: RunConfig) -> Planner:
 
 def _build_stance_planner(config: RunConfig) -> Planner:
     """The paper's scheme: the present contact mode's lifted model, as if it lasted."""
-    lmpc = config.lmpc
-    lift = build_dictionary(config.koopman).lift
-    measured_feet = config.koopman.feet == "measured"
+    lmpc, koopman = config.lmpc, config.koopman
+    steps = round(lmpc.model_dt / koopman.dataset.dt)
+    family = build_family(koopman)
+    lift = family.lift
+
+    def model_here(
+        params: ControllerParams, mode: Array, start: Start
+    ) -> tuple[Array, LinearModel | None]:
+        """Lifted state, and the model where that is not one of the tables."""
+        if koopman.model == "linear":
+            z = lift(None, start)
+            if koopman.feet == "fixed":
+                return z, None
+            model = jax.tree.map(lambda a: a[mode], params.tables.model)
+            return z, model._replace(B=input_map(model, start.feet))
+        numbers, force, _ = jax.tree.map(lambda a: a[mode], params.prediction)
+        if koopman.feet == "fixed":
+            start = start._replace(feet=params.feet[mode])
+        return lift(numbers, start), operating_point(family, numbers, start, force, steps)
+
     limited = min(lmpc.friction, lmpc.torque_fraction) < inf
 
     def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
@@ -122,15 +141,9 @@ def _build_stance_planner(config: RunConfig) -> Planner:
                 friction=lmpc.friction,
                 torque_fraction=lmpc.torque_fraction,
             )
+        z, model = model_here(params, task.mode, Start(body.x, feet))
         solution = solve_lmpc(
-            params.tables,
-            task.mode,
-            lift(body.x),
-            reference,
-            task.memory,
-            lmpc,
-            feet=feet if measured_feet else None,
-            rows=rows,
+            params.tables, task.mode, z, reference, task.memory, lmpc, model=model, rows=rows
         )
         # Out of iterations, the solver's point is feasible and no worse than its start; only
         # faulty data makes the shifted last plan the better choice.

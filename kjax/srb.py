@@ -8,7 +8,7 @@ stance legs at each end and so selects the contact mode. State and input order: 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -127,6 +127,46 @@ def rollout(
     def step(x: Array, u: Array) -> tuple[Array, Array]:
         x_next = rk4_step(params, alpha, x, u, dt)
         return x_next, x_next
+
+    _, states = jax.lax.scan(step, x0, inputs)
+    return jnp.concatenate([x0[None], states])
+
+
+Plant = Literal["body", "planted", "space"]
+PLANTS: tuple[Plant, ...] = ("body", "planted", "space")
+
+
+def trajectory(
+    plant: Plant,
+    params: SrbParams,
+    alpha: Float[Array, "2"],
+    x0: Float[Array, "6"],
+    inputs: Float[Array, "steps 4"],
+    dt: float,
+) -> Float[Array, "steps_plus_1 6"]:
+    """Trajectory from ``x0`` of one of three rigid bodies, which differ in what stays where.
+
+    Args:
+      plant: ``"body"`` for contact points and forces fixed in the body (the paper's), ``"planted"``
+        for feet that stay on the ground, ``"space"`` for that and forces in the frame of the start.
+      params: mass, inertia, contact points at the start.
+      alpha: (2,) stance legs at front and rear.
+      x0: (6,) start.
+      inputs: (steps, 4) force per leg and step [N].
+      dt: Runge-Kutta step [s].
+    """
+    if plant == "body":
+        return rollout(params, alpha, x0, inputs, dt)
+    if plant not in PLANTS:
+        raise ValueError(f"plant must be one of {list(PLANTS)}, got {plant!r}")
+    ground = contact_points(x0, params.feet)
+    world = plant == "space"
+    if world:
+        inputs = (inputs.reshape(-1, 2, 2) @ planar_rotation(x0[2]).T).reshape(-1, 4)
+
+    def step(x: Array, u: Array) -> tuple[Array, Array]:
+        x = rk4(lambda x: planted_dynamics(params, alpha, ground, x, u, world_forces=world), x, dt)
+        return x, x
 
     _, states = jax.lax.scan(step, x0, inputs)
     return jnp.concatenate([x0[None], states])

@@ -36,7 +36,7 @@ class FitReport(NamedTuple):
       condition: ratio of largest to smallest *retained* singular value [-].
       condition_full: the same over all of them; huge where columns repeat [-].
       residual_rms: (6,) one-step residual of each state [m, rad, m/s, rad/s].
-      finite: whether all data and all coefficients are finite.
+      finite: whether the triangle of all data, and so the data, and all coefficients are finite.
     """
 
     rank: Int[Array, ""]
@@ -109,46 +109,61 @@ def fit(
     use = None if use is None else jnp.concatenate([use, jnp.ones((Z.shape[1] - N,), bool)])
     rows = regression.of_rows(Z, Y)
     weights = regression.solve(rows, Z.shape[1], ridge=ridge, use=use)
-    return linear_model(weights.W, N), _report(rows, weights, Z, Y)
+    return linear_model(weights.W, N), _report(rows, weights)
 
 
 def linear_model(W: Float[Array, "columns N"], size: int) -> LinearModel:
     """The model that weights of ``[Pi(x), u]`` or ``[Pi(x), u, r (x) u]`` stand for."""
     K, N = W.T, size
-    B_feet = jnp.zeros((4, N, 4), K.dtype)
-    if K.shape[1] > N + 4:
-        # (end, coordinate, force) -> column of u: front forces are 0 and 1, rear ones 2 and 3.
-        products = K[:, N + 4 :].reshape(N, 2, 2, 2)
-        B_feet = B_feet.at[0:2, :, 0:2].set(jnp.moveaxis(products[:, 0], 1, 0))
-        B_feet = B_feet.at[2:4, :, 2:4].set(jnp.moveaxis(products[:, 1], 1, 0))
-    return LinearModel(A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=K[:, N : N + 4], B_feet=B_feet)
+    return LinearModel(
+        A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=K[:, N : N + 4], B_feet=_feet_map(K[:, N + 4 :])
+    )
 
 
 def fit_bilinear(
-    dictionary: Dictionary, data: Snapshots, *, ridge: float | Float[Array, ""] = 0.0
+    dictionary: Dictionary,
+    data: Snapshots,
+    *,
+    feet_terms: bool = False,
+    ridge: float | Float[Array, ""] = 0.0,
 ) -> tuple[BilinearModel, FitReport]:
-    """Bilinear model Pi(y) = A Pi(x) + sum_i Pi_i(x) B_i u of one contact mode, and a report."""
+    """Bilinear model of one contact mode and a report; arguments as of ``fit``."""
     N = dictionary.size
-    Z, Y = regressors(dictionary, data, bilinear=True)
+    Z, Y = regressors(dictionary, data, feet_terms=feet_terms, bilinear=True)
     rows = regression.of_rows(Z, Y)
     weights = regression.solve(rows, Z.shape[1], ridge=ridge)
     K = weights.W.T
-    B = jnp.moveaxis(K[:, N:].reshape(N, N, 4), 1, 0)
-    return BilinearModel(A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=B), _report(rows, weights, Z, Y)
+    products, feet = K[:, N : N + 4 * N], K[:, N + 4 * N :]
+    model = BilinearModel(
+        A=jnp.eye(N, dtype=K.dtype) + K[:, :N],
+        B=jnp.moveaxis(products.reshape(N, N, 4), 1, 0),
+        B_feet=_feet_map(feet),
+    )
+    return model, _report(rows, weights)
 
 
-def _report(
-    rows: regression.Triangle, weights: regression.Weights, Z: Array, Y: Array
-) -> FitReport:
+def _feet_map(weights: Float[Array, "N f"]) -> Float[Array, "4 N 4"]:
+    """B_feet from the weights of r (x) u, of which there may be none."""
+    N = weights.shape[0]
+    B_feet = jnp.zeros((4, N, 4), weights.dtype)
+    if weights.shape[1] == 0:
+        return B_feet
+    # (end, coordinate, force) -> column of u: front forces are 0 and 1, rear ones 2 and 3.
+    products = weights.reshape(N, 2, 2, 2)
+    B_feet = B_feet.at[0:2, :, 0:2].set(jnp.moveaxis(products[:, 0], 1, 0))
+    return B_feet.at[2:4, :, 2:4].set(jnp.moveaxis(products[:, 1], 1, 0))
+
+
+def _report(rows: regression.Triangle, weights: regression.Weights) -> FitReport:
     sigma, rank = weights.sigma, weights.rank
     smallest = jnp.min(jnp.where(jnp.arange(sigma.shape[0]) < rank, sigma, jnp.inf))
     return FitReport(
         rank=rank,
-        columns=jnp.asarray(Z.shape[1]),
+        columns=jnp.asarray(sigma.shape[0]),
         condition=sigma[0] / smallest,
         condition_full=sigma[0] / sigma[-1],
         residual_rms=regression.rms(rows, weights.W)[STATE_ROWS],
-        finite=jnp.isfinite(Z).all() & jnp.isfinite(Y).all() & jnp.isfinite(weights.W).all(),
+        finite=jnp.isfinite(rows.R).all() & jnp.isfinite(weights.W).all(),
     )
 
 

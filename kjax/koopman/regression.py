@@ -10,7 +10,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+BLOCK = 500  # rows factorised at once: they stay in the cache
+ROUNDING = 20.0  # singular values below so many roundings per column count as zero
 
 
 class Triangle(NamedTuple):
@@ -18,11 +22,11 @@ class Triangle(NamedTuple):
 
     Attributes:
       R: (c + t, c + t) upper triangle with R^T R = [Z Y]^T [Z Y].
-      count: number of rows, fewer where old ones were forgotten.
+      rows: number of them, fewer where old ones were forgotten.
     """
 
     R: Float[Array, "ct ct"]
-    count: Float[Array, ""]
+    rows: Float[Array, ""]
 
 
 class Weights(NamedTuple):
@@ -42,35 +46,40 @@ class Weights(NamedTuple):
 def empty(columns: int, targets: int, dtype: jnp.dtype | None = None) -> Triangle:
     """The triangle of no rows."""
     size = columns + targets
-    return Triangle(R=jnp.zeros((size, size), dtype), count=jnp.zeros((), dtype))
+    return Triangle(R=jnp.zeros((size, size), dtype), rows=jnp.zeros((), dtype))
 
 
 def accumulate(
     triangle: Triangle,
-    Z: Float[Array, "M c"],
-    Y: Float[Array, "M t"],
+    Z: Float[Array | np.ndarray, "M c"],
+    Y: Float[Array | np.ndarray, "M t"],
     *,
     forget: float | Float[Array, ""] = 1.0,
 ) -> Triangle:
     """The triangle with M rows more; all older rows first lose weight by ``forget`` (0 to 1]."""
-    rows = jnp.concatenate([Z, Y], axis=1)
-    old = jnp.sqrt(jnp.asarray(forget, rows.dtype)) * triangle.R
-    R = jnp.linalg.qr(jnp.concatenate([old, rows]), mode="r")
-    return Triangle(R=R[: old.shape[0]], count=forget * triangle.count + rows.shape[0])
+    new = jnp.concatenate([jnp.asarray(Z), jnp.asarray(Y)], axis=1)
+    old = jnp.sqrt(jnp.asarray(forget, new.dtype)) * triangle.R
+    R = jnp.linalg.qr(jnp.concatenate([old, new]), mode="r")
+    return Triangle(R=R[: old.shape[0]], rows=forget * triangle.rows + new.shape[0])
 
 
 def merge(one: Triangle, other: Triangle) -> Triangle:
     """The triangle of the rows of both."""
     R = jnp.linalg.qr(jnp.concatenate([one.R, other.R]), mode="r")
-    return Triangle(R=R, count=one.count + other.count)
+    return Triangle(R=R, rows=one.rows + other.rows)
 
 
-def of_rows(Z: Float[Array, "M c"], Y: Float[Array, "M t"]) -> Triangle:
+def of_rows(Z: Float[Array | np.ndarray, "M c"], Y: Float[Array | np.ndarray, "M t"]) -> Triangle:
     """The triangle of M rows, fewer than columns or more."""
-    size = Z.shape[1] + Y.shape[1]
-    R = jnp.linalg.qr(jnp.concatenate([Z, Y], axis=1), mode="r")
+    rows = jnp.concatenate([jnp.asarray(Z), jnp.asarray(Y)], axis=1)
+    count, size = rows.shape
+    if count > 4 * BLOCK and size < BLOCK // 2:
+        filled = jnp.zeros((-(-count // BLOCK) * BLOCK, size), rows.dtype).at[:count].set(rows)
+        blocks = filled.reshape(-1, BLOCK, size)
+        rows = jax.lax.map(lambda block: jnp.linalg.qr(block, mode="r"), blocks).reshape(-1, size)
+    R = jnp.linalg.qr(rows, mode="r")
     R = jnp.zeros((size, size), R.dtype).at[: R.shape[0]].set(R[:size])
-    return Triangle(R=R, count=jnp.asarray(Z.shape[0], R.dtype))
+    return Triangle(R=R, rows=jnp.asarray(count, R.dtype))
 
 
 def solve(
@@ -78,7 +87,7 @@ def solve(
     columns: int,
     *,
     ridge: float | Float[Array, ""] = 0.0,
-    use: Bool[Array, "c"] | None = None,
+    use: Bool[Array | np.ndarray, "c"] | None = None,
 ) -> Weights:
     """Minimum-norm solution in the scaled columns.
 
@@ -94,22 +103,24 @@ def solve(
     norm = jnp.linalg.norm(R, axis=0)
     scale = jnp.where(norm > 0, norm, 1.0)
     left, sigma, right = jnp.linalg.svd(R / scale)
-    size = jnp.maximum(triangle.count, columns)
-    keep = sigma > sigma[0] * size * jnp.finfo(R.dtype).eps
+    keep = sigma > sigma[0] * ROUNDING * columns * jnp.finfo(R.dtype).eps
     safe = jnp.where(keep, sigma, 1.0)
     gain = jnp.where(keep, safe / (safe**2 + ridge), 0.0)
     W = right.T @ (gain[:, None] * (left.T @ Y))
-    return Weights(W=W / scale[:, None], rank=keep.sum(), sigma=sigma)
+    W = jnp.where(norm[:, None] > 0, W / scale[:, None], 0.0)
+    return Weights(W=W, rank=keep.sum(), sigma=sigma)
 
 
 def rms(triangle: Triangle, W: Float[Array, "c t"]) -> Float[Array, "t"]:
     """Root mean square of Y - Z W over the triangle's rows; these need not be those of the fit."""
     move = jnp.concatenate([-W, jnp.eye(W.shape[1], dtype=W.dtype)])
-    size = jnp.maximum(triangle.count, 1.0)
+    size = jnp.maximum(triangle.rows, 1.0)
     return jnp.linalg.norm(triangle.R @ move, axis=0) / jnp.sqrt(size)
 
 
-def block_rows(triangle: Triangle, Z: Float[Array, "B M c"], Y: Float[Array, "B M t"]) -> Triangle:
+def block_rows(
+    triangle: Triangle, Z: Float[Array | np.ndarray, "B M c"], Y: Float[Array | np.ndarray, "B M t"]
+) -> Triangle:
     """B blocks of rows one after the other: the memory of one block."""
 
     def one(triangle: Triangle, block: tuple[Array, Array]) -> tuple[Triangle, None]:

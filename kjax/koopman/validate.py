@@ -1,13 +1,15 @@
 """How well a model predicts: error of every state against the time since the start."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax import srb
+from kjax.koopman import families
 from kjax.koopman.dataset import SampleRanges, sample
 from kjax.koopman.models import LinearModel, rollout
 from kjax.koopman.observables import Dictionary
@@ -83,3 +85,85 @@ def summarise(errors: Float[Array, "states profiles steps 6"]) -> ErrorStatistic
         std=flat.std(axis=0),
         max=jnp.abs(flat).max(axis=0),
     )
+
+
+# ---------------------------------------------------------------- any family, any plant
+
+QUANTILES = (0.5, 0.9, 0.99)
+
+
+def open_loop(
+    family: families.Family,
+    numbers: Any,
+    start: families.Start,
+    inputs: Float[Array, "steps 4"],
+    *,
+    frozen: bool = False,
+) -> Float[Array, "steps_plus_1 6"]:
+    """Prediction of a model; ``frozen`` as an LMPC uses it: linearised at the start.
+
+    The force of that linearisation is the mean of the inputs.
+    """
+    if not frozen:
+        return families.rollout(family, numbers, start, inputs)
+    here = families.operating_point(family, numbers, start, inputs.mean(axis=0))
+    return rollout(here, family.lift(numbers, start), inputs, start.feet)
+
+
+def model_errors(
+    family: families.Family,
+    numbers: Any,
+    plant: srb.Plant,
+    body: srb.SrbParams,
+    alpha: Float[Array, "2"],
+    starts: Float[Array, "states 6"],
+    inputs: Float[Array, "profiles steps 4"],
+    *,
+    frozen: bool = False,
+) -> Float[Array, "states profiles steps 6"]:
+    """Predicted minus true states of every start under every force profile, open loop."""
+
+    def one(x0: Array, u: Array) -> Array:
+        predicted = open_loop(family, numbers, families.Start(x0, body.feet), u, frozen=frozen)
+        return (predicted - srb.trajectory(plant, body, alpha, x0, u, family.dt))[1:]
+
+    return jax.vmap(lambda x0: jax.vmap(lambda u: one(x0, u))(inputs))(starts)
+
+
+def quantiles(
+    errors: Float[Array, "states profiles steps 6"],
+) -> Float[Array, "Q steps 6"]:
+    """Quantiles (``QUANTILES``) of the absolute error, per step and state."""
+    flat = jnp.abs(errors.reshape(-1, *errors.shape[-2:]))
+    return jnp.quantile(flat, jnp.asarray(QUANTILES, flat.dtype), axis=0)
+
+
+def bootstrap(
+    key: PRNGKeyArray,
+    errors: Float[Array, "episodes ..."],
+    statistic: Callable[[Array], Array],
+    *,
+    draws: int = 400,
+    level: float = 0.95,
+) -> tuple[Array, Array]:
+    """Percentile interval of a statistic, episodes drawn again with replacement.
+
+    Rows of one episode are not independent of each other, so whole episodes are drawn.
+
+    Args:
+      key: random key.
+      errors: (episodes, ...) what the statistic is of.
+      statistic: from such an array to numbers.
+      draws: resamples.
+      level: of the interval.
+
+    Returns:
+      Lower and upper end, each shaped like the statistic.
+    """
+    if errors.shape[0] < 2:
+        raise ValueError(f"errors must hold at least 2 episodes, got {errors.shape[0]}")
+    index = jax.random.randint(key, (draws, errors.shape[0]), 0, errors.shape[0])
+    values = jax.lax.map(lambda i: statistic(errors[i]), index)
+    side = 0.5 * (1.0 - level)
+    low, high = jnp.quantile(values, jnp.asarray([side, 1.0 - side]), axis=0)
+    return low, high

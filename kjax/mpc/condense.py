@@ -38,7 +38,7 @@ class CondensedQp(NamedTuple):
 def condense(
     A: Float[Array, "N N"],
     B: Float[Array, "N 4"],
-    state_weights: Float[Array, "6"],
+    state_weights: Float[Array, "6"] | Float[Array, "k 6"],
     input_weights: Float[Array, "4"],
     horizon: int,
 ) -> CondensedQp:
@@ -47,7 +47,7 @@ def condense(
     Args:
       A: lifted transition per model step.
       B: input map per model step.
-      state_weights: diagonal of Q, order of ``STATE_NAMES``.
+      state_weights: diagonal of Q, order of ``STATE_NAMES``; (6,), or (k, 6) for every step.
       input_weights: diagonal of R [1/N^2].
       horizon: number k of model steps, at least 1.
     """
@@ -66,6 +66,39 @@ def condense(
     blocks = jnp.stack(forced)[np.maximum(lag, 0)] * (lag >= 0)[:, :, None, None]
     B_qp = jnp.moveaxis(blocks, 1, 2).reshape(6 * horizon, m * horizon)
     A_qp = jnp.concatenate(free)
-    G = 2.0 * (B_qp * jnp.tile(state_weights, horizon)[:, None]).T
+    weights = jnp.broadcast_to(state_weights, (horizon, 6)).reshape(-1)
+    G = 2.0 * (B_qp * weights[:, None]).T
     H = G @ B_qp + 2.0 * jnp.diag(jnp.tile(input_weights, horizon))
     return CondensedQp(H=0.5 * (H + H.T), F=G @ A_qp, G=G, A_qp=A_qp, B_qp=B_qp)
+
+
+def cautious_weights(
+    A: Float[Array, "N N"],
+    state_weights: Float[Array, "6"],
+    spread: Float[Array, "6"],
+    caution: float,
+    horizon: int,
+) -> Float[Array, "k 6"]:
+    """Q of every step, less where the prediction is less certain.
+
+    The error of one step, white and of standard deviation s, grows along the horizon to
+    S_i = sum_{j<i} A^j diag(s^2) A^j^T; step i weighs Q / (1 + caution S_i / mean(S)).
+
+    Args:
+      A: lifted transition per model step.
+      state_weights: diagonal of Q.
+      spread: standard deviation of the one-step error, the model's uncertainty.
+      caution: 0 to trust the whole horizon alike [-].
+      horizon: number k of model steps.
+    """
+    state = A[STATE_ROWS, STATE_ROWS]
+    step = jnp.diag(spread**2)
+    total, power, rows = jnp.zeros_like(step), jnp.eye(6, dtype=A.dtype), []
+    for _ in range(horizon):
+        total = total + power @ step @ power.T
+        power = state @ power
+        rows.append(jnp.diagonal(total))
+    variance = jnp.stack(rows)
+    mean = variance.mean(axis=0)
+    ratio = jnp.where(mean > 0, variance / jnp.where(mean > 0, mean, 1.0), 0.0)
+    return state_weights / (1.0 + caution * ratio)

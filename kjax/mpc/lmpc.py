@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from kjax import qp
 from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman.models import LinearModel, aggregate, input_map
-from kjax.mpc.condense import condense
+from kjax.mpc.condense import cautious_weights, condense
 from kjax.mpc.limits import ForceRows
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
@@ -30,6 +30,7 @@ class LmpcTables(NamedTuple):
       lower: (M, nu) lower force bounds, body frame [N]; swing ends are fixed to 0.
       upper: (M, nu) upper force bounds [N].
       model: prediction models over one model_dt, for contact points measured on line.
+      spread: (M, 6) standard deviation of their error over one model_dt [m, rad, m/s, rad/s].
       state_weights: (M, 6) diagonal of Q.
       input_weights: (M, 4) diagonal of R [1/N^2].
     """
@@ -41,6 +42,7 @@ class LmpcTables(NamedTuple):
     lower: Float[Array, "M nu"]
     upper: Float[Array, "M nu"]
     model: LinearModel
+    spread: Float[Array, "M 6"]
     state_weights: Float[Array, "M 6"]
     input_weights: Float[Array, "M 4"]
 
@@ -106,6 +108,8 @@ def build_tables(
     steps: int,
     horizon: int,
     feet: Float[Array, "M 2 2"],
+    spread: Float[Array, "M 6"] | None = None,
+    caution: float = 0.0,
 ) -> LmpcTables:
     """Tables of all contact modes; call it in float64.
 
@@ -115,19 +119,25 @@ def build_tables(
       steps: number of model steps that one step of the prediction holds.
       horizon: number k of prediction steps.
       feet: (M, 2, 2) nominal contact points [m].
+      spread: (M, 6) standard deviation of the one-step error of each model; ``None`` for none.
+      caution: see ``condense.cautious_weights``.
     """
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
     Q, R, lower, upper, u_ref = (jnp.asarray(value) for value in settings)
 
     swinging = jnp.tile(lower == upper, (1, horizon))
+    # White from step to step.
+    spread = jnp.zeros_like(Q) if spread is None else spread * steps**0.5
 
     def one(
-        model: LinearModel, Q: Array, R: Array, feet: Array, swinging: Array
+        model: LinearModel, Q: Array, R: Array, feet: Array, swinging: Array, spread: Array
     ) -> tuple[qp.Prepared, Array, Array]:
+        if caution > 0:
+            Q = cautious_weights(model.A, Q, spread, caution, horizon)
         problem = condense(model.A, input_map(model, feet), Q, R, horizon)
         return qp.prepare(problem.H, swinging), problem.F, problem.G
 
-    hessian, F, G = jax.vmap(one)(model, Q, R, feet, swinging)
+    hessian, F, G = jax.vmap(one)(model, Q, R, feet, swinging, spread)
     return LmpcTables(
         hessian=hessian,
         F=F,
@@ -136,6 +146,7 @@ def build_tables(
         lower=jnp.tile(lower, (1, horizon)),
         upper=jnp.tile(upper, (1, horizon)),
         model=model,
+        spread=spread,
         state_weights=Q,
         input_weights=R,
     )
@@ -198,7 +209,7 @@ def solve_lmpc(
     reference: Float[Array, "k 6"],
     memory: LmpcMemory,
     config: LmpcConfig,
-    feet: Float[Array, "2 2"] | None = None,
+    model: LinearModel | None = None,
     rows: ForceRows | None = None,
 ) -> LmpcSolution:
     """Force plan of one tick.
@@ -206,20 +217,21 @@ def solve_lmpc(
     Args:
       tables: of all modes.
       mode: contact mode, an index; traced.
-      z: lifted state Pi(x).
+      z: lifted state, of the tables' models or of ``model``.
       reference: (k, 6) states wanted.
       memory: of the last tick.
       config: solver settings (static).
-      feet: (2, 2) measured contact points [m]; ``None`` uses the tables' own.
+      model: over one model_dt and for the contact points as they are, in place of the tables' own.
       rows: on the forces of every step, besides the box.
     """
     lower, upper = tables.lower[mode], tables.upper[mode]
-    if feet is None:
+    if model is None:
         hessian, index, F, G = tables.hessian, mode, tables.F[mode], tables.G[mode]
     else:
-        model = jax.tree.map(lambda a: a[mode], tables.model)
-        weights = tables.state_weights[mode], tables.input_weights[mode]
-        problem = condense(model.A, input_map(model, feet), *weights, config.horizon)
+        Q, R = tables.state_weights[mode], tables.input_weights[mode]
+        if config.caution > 0:
+            Q = cautious_weights(model.A, Q, tables.spread[mode], config.caution, config.horizon)
+        problem = condense(model.A, model.B, Q, R, config.horizon)
         hessian, index = qp.prepare(problem.H, lower == upper), None
         F, G = problem.F, problem.G
     q = F @ z - G @ reference.reshape(-1) + tables.q_input[mode]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.mpc.condense import condense
+from kjax.mpc.condense import cautious_weights, condense
 
 N, K = 9, 5  # observables, steps
 Q = np.array([3.0, 5.0, 2.0, 0.5, 0.7, 0.1])
@@ -114,3 +114,29 @@ def test_a_horizon_of_one_is_a_single_step(system):
 def test_no_horizon_is_refused_by_name(system):
     with pytest.raises(ValueError, match=r"horizon .*0"):
         condense(*map(jnp.asarray, (*system, Q, R)), horizon=0)
+
+
+def test_caution_weighs_what_grows_uncertain_less():
+    """A chain of two integrators: white noise on v makes p's variance grow like i^3 / 3."""
+    A = np.eye(7)
+    A[1, 4] = 0.1  # p_x from v_x
+    weights = jnp.asarray([2.0, 1.0, 1.0, 3.0, 1.0, 1.0])
+    spread = jnp.asarray([0.0, 0.0, 0.0, 0.5, 0.0, 0.0])
+    got = cautious_weights(jnp.asarray(A), weights, spread, 0.5, 6)
+    i = np.arange(1, 7)
+    np.testing.assert_allclose(got[:, 3], 3.0 / (1 + 0.5 * i / i.mean()), rtol=1e-12)
+    along = np.cumsum((i - 1) ** 2)  # of p after i steps, in units of (0.1 * 0.5)^2
+    np.testing.assert_allclose(got[:, 0], 2.0 / (1 + 0.5 * along / along.mean()), rtol=1e-12)
+    np.testing.assert_array_equal(got[:, 1], 1.0)  # nothing uncertain reaches p_z
+    trusting = cautious_weights(jnp.asarray(A), weights, spread, 0.0, 6)
+    np.testing.assert_array_equal(trusting, np.tile(weights, (6, 1)))
+
+
+def test_weights_of_every_step_reach_the_hessian():
+    rng = np.random.default_rng(0)
+    A = jnp.asarray(np.eye(7) + 0.05 * rng.normal(size=(7, 7)))
+    B = jnp.asarray(rng.normal(size=(7, 4)))
+    weights = rng.uniform(1, 2, (3, 6))
+    problem = condense(A, B, jnp.asarray(weights), jnp.full(4, 0.1), 3)
+    wanted = 2 * problem.B_qp.T @ np.diag(weights.reshape(-1)) @ problem.B_qp + 0.2 * np.eye(12)
+    np.testing.assert_allclose(problem.H, wanted, rtol=1e-12)

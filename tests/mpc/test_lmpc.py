@@ -48,6 +48,12 @@ condense_all = jax.jit(lmpc.build_tables, static_argnames=("steps", "horizon"))
 solve = jax.jit(lmpc.solve_lmpc, static_argnames="config")
 
 
+def here(tables, mode, feet):
+    """The tables' model of a mode for contact points that are measured."""
+    model = jax.tree.map(lambda a: a[mode], tables.model)
+    return model._replace(B=models.input_map(model, feet))
+
+
 def build(model, feet, config, bound):
     """Tables of all modes, with the same contact points in each."""
     return condense_all(
@@ -178,7 +184,8 @@ def test_contact_points_make_no_difference_to_a_model_that_ignores_them(bounded,
     x, reference = start
     arguments = (bounded, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
     offline = solve(*arguments, config=BOUNDED)
-    online = solve(*arguments, config=BOUNDED, feet=jnp.array([[0.1, -0.2], [-0.3, -0.4]]))
+    model = here(bounded, Mode.TROT, jnp.array([[0.1, -0.2], [-0.3, -0.4]]))
+    online = solve(*arguments, config=BOUNDED, model=model)
     assert offline.status == online.status == Status.SOLVED
     # The same iterations but for rounding: 2e-16 times condition 1e5 times forces of 1e2 N.
     np.testing.assert_allclose(online.plan, offline.plan, rtol=0, atol=1e-8)
@@ -196,7 +203,7 @@ def test_measured_contact_points_at_their_nominal_place_give_the_tables_plan(
     x, reference = start
     arguments = (measured, jnp.asarray(int(mode)), lift(x), reference, memory())
     offline = solve(*arguments, config=BOUNDED)
-    online = solve(*arguments, config=BOUNDED, feet=body.feet)
+    online = solve(*arguments, config=BOUNDED, model=here(measured, mode, body.feet))
     assert offline.status == online.status == Status.SOLVED
     # As above: rounding seen through the condition.
     np.testing.assert_allclose(online.plan, offline.plan, rtol=0, atol=1e-8)
@@ -210,7 +217,8 @@ def test_a_foot_further_forward_takes_less_of_the_weight_to_hold_the_pitch(measu
     for shift in (-0.05, 0.0, 0.05):
         feet = body.feet.at[0, 0].add(shift)
         arguments = (measured, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
-        force = solve(*arguments, config=BOUNDED, feet=feet).plan[:4]
+        model = here(measured, Mode.TROT, feet)
+        force = solve(*arguments, config=BOUNDED, model=model).plan[:4]
         shares.append(float(force[1] / (force[1] + force[3])))
     assert shares[0] > shares[1] > shares[2]
 

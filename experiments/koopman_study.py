@@ -1,0 +1,277 @@
+"""Which models predict the rigid body, how far, and how sure: every family beside the others.
+
+Fits or builds every model of kjax.koopman on the same data, rolls it out from 50 random starts
+under 50 random force profiles, and reports the error against the horizon, as the model itself and
+as an LMPC uses it (linearised at the start). Leaves metrics.json, table.md and figure.png.
+"""
+
+import argparse
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kjax import cli, srb
+from kjax.config import SrbConfig
+from kjax.koopman import edmd, families, learned, observables, validate
+from kjax.koopman.dataset import SampleRanges, sample
+from kjax.types import GRAVITY, MODE_ALPHA, STATE_NAMES, Mode
+
+DT = 1e-3  # s
+MODES = {"trot": Mode.TROT, "front": Mode.FRONT, "rear": Mode.REAR}
+HORIZONS = (0.001, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)  # s
+ROLLOUTS, STEPS = 100, 100  # of the training data, per mode
+STARTS, PROFILES = 50, 50  # of the test
+VELOCITY = slice(3, 5)
+# Half-ranges (p_x, p_z, theta, v_x, v_z, omega; F_x, F_z about half the weight): a calm trot, and
+# what a bound goes through.
+RANGES = {
+    "trot ranges": ((0.5, 0.1, 0.15, 0.5, 0.5, 1.0), (15.0, 20.0)),
+    "bound ranges": ((0.5, 0.1, 0.4, 1.0, 1.0, 3.0), (40.0, 62.0)),
+}
+Fitted = dict[str, tuple[families.Family, Any, srb.Plant, bool]]
+
+
+def main() -> None:
+    """Parse the command line and run the study."""
+    parser = cli.script_parser(__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="less of it: to check the script")
+    parser.add_argument("--no-learned", action="store_true", help="leave out the networks")
+    parser.add_argument("--seed", type=int, default=1, help="of the training data")
+    args = parser.parse_args()
+    folder = cli.output_folder(args, "koopman_study")
+    cli.configure_jax()
+    jax.config.update("jax_enable_x64", True)
+    clock = time.perf_counter()
+    result = study(args)
+    (folder / "table.md").write_text(table(result), encoding="utf-8")
+    figure(result, folder / "figure.png")
+    record = {"provenance": cli.provenance(), **summary(result), **result}
+    cli.save_json(folder / "metrics.json", record)
+    print(table(result))
+    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+
+
+def study(args: argparse.Namespace) -> dict[str, Any]:
+    """Errors of all models: ranges -> mode -> model -> statistics against the horizon."""
+    body = edmd.srb_params(SrbConfig())
+    states, profiles = (10, 10) if args.quick else (STARTS, PROFILES)
+    out: dict[str, Any] = {"horizons_s": HORIZONS, "errors": {}, "spectrum": {}}
+    chosen = {"trot": Mode.TROT} if args.quick else MODES
+    for name, (state_half, force_half) in RANGES.items():
+        out["errors"][name] = {}
+        for gait, mode in chosen.items():
+            here = jax.tree.map(lambda a, m=mode: a[m], body)
+            alpha = jnp.asarray(MODE_ALPHA[mode], float)
+            ranges = ranges_of(state_half, force_half, here)
+            print(f"{name}, {gait}", flush=True)
+            models = fit_all(args, here, alpha, ranges)
+            if name == "bound ranges":
+                A = models["linear EDMD, p = 4 (the paper)"][1].A
+                rates = edmd.spectrum(np.asarray(A), DT)
+                out["spectrum"][gait] = {"real": rates.real, "imaginary": rates.imag}
+            key = jax.random.key(1000 + mode)
+            draw = partial(sample, params=here, alpha=alpha, ranges=ranges, dt=DT)
+            starts = draw(key, rollouts=states, steps=1).states[:, 0]
+            forces = draw(
+                jax.random.fold_in(key, 1), rollouts=profiles, steps=round(HORIZONS[-1] / DT)
+            ).inputs
+            out["errors"][name][gait] = {
+                label: judge(family, numbers, plant, here, alpha, starts, forces, frozen)
+                for label, (family, numbers, plant, frozen) in models.items()
+            }
+    return out
+
+
+def ranges_of(
+    state_half: tuple[float, ...], force_half: tuple[float, float], body: srb.SrbParams
+) -> SampleRanges:
+    """Sampling ranges about standing, forces about half the weight per leg."""
+    centre = jnp.array([0.0, float(body.mass) * GRAVITY / 2] * 2)
+    half = jnp.array([*force_half] * 2)
+    return SampleRanges(
+        state_centre=jnp.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0]),
+        state_half=jnp.array(state_half),
+        input_low=centre - half,
+        input_high=centre + half,
+        feet_half=jnp.zeros(2),
+    )
+
+
+def fit_all(
+    args: argparse.Namespace, body: srb.SrbParams, alpha: Any, ranges: SampleRanges
+) -> Fitted:
+    """Every model of a contact mode: family, numbers, plant it is judged on, frozen or not."""
+    data = sample(
+        jax.random.key(args.seed), body, alpha, ranges, rollouts=ROLLOUTS, steps=STEPS, dt=DT
+    )
+    known = families.BodyModel(body, alpha)
+    out: Fitted = {
+        "SRB linearised at hover": (
+            families.linear(observables.states_only(), DT),
+            families.linearised_srb(body, alpha, 0.27, DT), "body", False,
+        ),
+        "SRB linearised at the start": (families.rigid_body(DT), known, "body", True),
+    }  # fmt: skip
+    dictionaries = {
+        "affine fit, no lifting": observables.states_only(),
+        "linear EDMD, p = 4 (the paper)": observables.paper(4),
+        "linear EDMD, p = 4, with R": observables.paper(4, constant_rotation=True),
+        "linear EDMD, monomials to 3": observables.monomials(3),
+        "linear EDMD, 40 Fourier features": observables.fourier(40, scale=0.5),
+    }
+    for label, dictionary in dictionaries.items():
+        model, _ = jax.jit(partial(edmd.fit, dictionary))(data)
+        out[label] = (families.linear(dictionary, DT), model, "body", False)
+    for label, with_rotation in (
+        ("bilinear EDMD, p = 4, without R", False),
+        ("bilinear EDMD, p = 4, with R", True),
+    ):
+        dictionary = observables.paper(4, constant_rotation=with_rotation)
+        model, _ = jax.jit(partial(edmd.fit_bilinear, dictionary))(data)
+        family = families.bilinear(dictionary, DT)
+        out[label] = (family, model, "body", False)
+        if with_rotation:
+            out[f"{label}, linearised at the start"] = (family, model, "body", True)
+    if not args.no_learned:
+        heads: tuple[learned.Head, ...] = ("linear", "bilinear")
+        for head in heads:
+            fit = jax.jit(
+                partial(learned.train, head=head, updates=100 if args.quick else 2000, window=50)
+            )
+            model, how = fit(jax.random.key(7), data)
+            if bool(how.diverged):
+                print(f"  learned, {head}: the training diverged; its best model is used")
+            family = learned.learned(DT, model.head.A.shape[-1] - 7)
+            out[f"learned lifting, {head}"] = (family, model, "body", False)
+    exact = families.exact(DT)
+    out["exact bilinear (forces fixed in space)"] = (exact, known, "space", False)
+    out["exact bilinear, linearised at the start"] = (exact, known, "space", True)
+    return out
+
+
+def judge(
+    family: families.Family,
+    numbers: Any,
+    plant: srb.Plant,
+    body: srb.SrbParams,
+    alpha: Any,
+    starts: Any,
+    forces: Any,
+    frozen: bool,
+) -> dict[str, Any]:
+    """Statistics of the error at the horizons, each with its bootstrap interval over the starts."""
+    at = np.round(np.array(HORIZONS) / DT).astype(int) - 1
+
+    @jax.jit
+    def errors(starts: Any, forces: Any) -> Any:
+        found = validate.model_errors(
+            family, numbers, plant, body, alpha, starts, forces, frozen=frozen
+        )
+        return found[:, :, at]
+
+    found = errors(starts, forces)
+    statistics = jax.device_get(validate.summarise(found))
+    key = jax.random.key(0)
+
+    def rms(rows: Any) -> Any:
+        return jnp.sqrt(jnp.mean(rows**2, axis=(0, 1)))
+
+    low, high = jax.device_get(jax.jit(lambda e: validate.bootstrap(key, e, rms))(found))
+    return {
+        **{name: value for name, value in statistics._asdict().items()},
+        "rms": np.asarray(rms(found)),
+        "rms_low": low,
+        "rms_high": high,
+        "quantiles": np.asarray(validate.quantiles(found)),
+        "max_velocity": statistics.max[:, VELOCITY].max(axis=1),
+        "observables": family.size,
+    }
+
+
+def summary(result: dict[str, Any]) -> dict[str, float]:
+    """The figures that the README argues with: the worst contact mode on the bound's ranges."""
+    modes = result["errors"]["bound ranges"].values()
+    fifty, last = HORIZONS.index(0.05), -1
+
+    def worst(label: str, at: int) -> float:
+        return float(max(mode[label]["max_velocity"][at] for mode in modes))
+
+    return {
+        "linear_max_velocity_error_50ms": worst("linear EDMD, p = 4 (the paper)", fifty),
+        "bilinear_max_velocity_error_50ms": worst("bilinear EDMD, p = 4, with R", fifty),
+        "exact_max_error_500ms": float(
+            max(mode["exact bilinear (forces fixed in space)"]["max"][last].max() for mode in modes)
+        ),
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """Largest velocity error after 50 ms and rms after 0.5 s, as Markdown."""
+    lines = []
+    fifty, last = HORIZONS.index(0.05), -1
+    for name, modes in result["errors"].items():
+        heads = " | ".join(f"{gait}, 50 ms | {gait}, 0.5 s" for gait in modes)
+        lines += [
+            f"| {name}: error of the velocity [m/s] | observables | {heads} |",
+            "|---|---" + "|---|---" * len(modes) + "|",
+        ]
+        for label, entry in next(iter(modes.values())).items():
+            cells = []
+            for mode in modes.values():
+                here = mode[label]
+                cells.append(f"{here['max_velocity'][fifty]:.1e}")
+                rms, low, high = (
+                    np.linalg.norm(here[k][last][VELOCITY]) for k in ("rms", "rms_low", "rms_high")
+                )
+                cells.append(f"{rms:.1e} ({low:.1e} to {high:.1e})")
+            lines.append(f"| {label} | {entry['observables']} | " + " | ".join(cells) + " |")
+        lines.append("")
+    lines.append("50 ms: largest error of the test; 0.5 s: rms and its 95 % interval over starts.")
+    return "\n".join(lines) + "\n"
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Error of velocity and pitch rate against the horizon, bound ranges."""
+    modes = result["errors"]["bound ranges"]
+    fig, axes = plt.subplots(
+        2, len(modes), figsize=(4.2 * len(modes) + 2.5, 7), sharex=True, sharey="row",
+        layout="constrained", squeeze=False,
+    )  # fmt: skip
+    for column, (gait, models) in enumerate(modes.items()):
+        for row, (rows, label) in enumerate(
+            ((VELOCITY, "velocity [m/s]"), (slice(5, 6), f"{STATE_NAMES[5]} [rad/s]"))
+        ):
+            ax = axes[row][column]
+            for i, (name, entry) in enumerate(models.items()):
+                value = np.linalg.norm(entry["rms"][:, rows], axis=1)
+                low, high = (
+                    np.linalg.norm(entry[k][:, rows], axis=1) for k in ("rms_low", "rms_high")
+                )
+                floor = 1e-16  # what is zero is drawn here
+                style = "--" if "linearised" in name else "-"
+                ax.loglog(HORIZONS, np.maximum(value, floor), style, color=f"C{i % 10}",
+                          lw=2.5 if "paper" in name else 1.2, label=name)  # fmt: skip
+                ax.fill_between(HORIZONS, np.maximum(low, floor), np.maximum(high, floor),
+                                color=f"C{i % 10}", alpha=0.15, lw=0)  # fmt: skip
+            ax.grid(alpha=0.3)
+            ax.set_ylim(1e-16, 10.0)
+            if column == 0:
+                ax.set_ylabel(f"rms error of the {label}")
+            if row == 0:
+                ax.set_title(f"{gait} stance")
+            else:
+                ax.set_xlabel("horizon [s]")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside right upper", fontsize=8)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
+
+
+if __name__ == "__main__":
+    cli.run(main)

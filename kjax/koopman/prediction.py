@@ -1,0 +1,135 @@
+"""The prediction model that a config names: family, numbers of every contact mode, uncertainty."""
+
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from kjax import srb
+from kjax.config import KoopmanConfig
+from kjax.koopman import families, storage
+from kjax.koopman.dataset import ranges_from_config, sample
+from kjax.koopman.edmd import build_dictionary, fit_bilinear
+from kjax.koopman.families import BodyModel, Family, ResidualModel
+from kjax.koopman.learned import learned
+from kjax.koopman.observables import states_only
+from kjax.types import MODE_ALPHA, Mode
+
+
+class Prediction(NamedTuple):
+    """Numbers of a prediction model, stacked over ``types.Mode``; data.
+
+    Attributes:
+      numbers: of the family.
+      force: (M, 4) force per leg about which it is linearised, body frame [N].
+      spread: (M, 6) standard deviation of the one-step error; the model's uncertainty
+        [m, rad, m/s, rad/s].
+    """
+
+    numbers: Any
+    force: Float[Array, "M 4"]
+    spread: Float[Array, "M 6"]
+
+
+def build_family(config: KoopmanConfig) -> Family:
+    """The family of a config's model.
+
+    Raises:
+      ValueError: for a file that cannot be used.
+    """
+    dt = config.dataset.dt
+    if config.model == "linear":
+        return families.linear(build_dictionary(config), dt)
+    if config.model == "srb_hover":
+        return families.linear(states_only(), dt, "srb_hover")
+    if config.model == "bilinear":
+        return families.bilinear(build_dictionary(config), dt)
+    if config.model == "srb":
+        return families.rigid_body(dt)
+    if config.model == "planted":
+        return families.planted(dt)
+    if config.model == "exact":
+        return families.exact(dt)
+    stored = _stored(config)
+    if config.model == "residual":
+        return families.residual(dt, families.affine_features)
+    return learned(dt, stored.numbers.head.A.shape[-1] - len(states_only().names))
+
+
+def build_prediction(
+    body: srb.SrbParams, config: KoopmanConfig, key: PRNGKeyArray, *, height: float
+) -> Prediction:
+    """Numbers of a config's model in every contact mode; for all but the linear EDMD model.
+
+    Args:
+      body: parameters of the rigid body in every mode, stacked.
+      config: of the model.
+      key: random key of the training data.
+      height: of the centre of mass, for what is linearised beforehand [m].
+
+    Raises:
+      ValueError: for a file that cannot be used, and for a fit that is not finite.
+    """
+    alpha = jnp.asarray(MODE_ALPHA, float)
+    force = jax.vmap(families.hover)(body, alpha)
+    spread = jnp.zeros((len(Mode), 6))
+    numbers: Any
+    if config.model == "srb_hover":
+        numbers = jax.vmap(
+            lambda body, alpha: families.linearised_srb(body, alpha, height, config.dataset.dt)
+        )(body, alpha)
+    elif config.model in ("srb", "planted", "exact"):
+        numbers = BodyModel(body, alpha)
+    elif config.model == "bilinear":
+        numbers, spread, finite = _fit_bilinear(body, config, key)
+        if not bool(finite):
+            raise ValueError("the bilinear fit is not finite: check srb and koopman.dataset ranges")
+    elif config.model in ("residual", "learned"):
+        stored = _stored(config)
+        own = jax.tree.map(jnp.asarray, stored.numbers)
+        numbers = ResidualModel(BodyModel(body, alpha), own) if config.model == "residual" else own
+        spread = jnp.asarray(stored.spread)
+    else:
+        raise ValueError(f"model '{config.model}' has its own tables (edmd.fit_modes)")
+    return Prediction(numbers=numbers, force=force, spread=spread)
+
+
+@partial(jax.jit, static_argnames="config")
+def _fit_bilinear(body: srb.SrbParams, config: KoopmanConfig, key: Array) -> tuple[Any, Any, Any]:
+    dictionary, data = build_dictionary(config), config.dataset
+    measured = config.feet == "measured"
+
+    def one(key: Array, alpha: Array, body: srb.SrbParams) -> tuple[Any, Any]:
+        ranges = ranges_from_config(data, vary_feet=measured)
+        snapshots = sample(
+            key, body, alpha, ranges, rollouts=data.rollouts,
+            steps=round(data.duration / data.dt), dt=data.dt, hold=data.hold,
+        )  # fmt: skip
+        return fit_bilinear(dictionary, snapshots, feet_terms=measured)
+
+    keys = jax.random.split(key, len(Mode))
+    model, report = jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA, float), body)
+    return model, report.residual_rms, report.finite.all()
+
+
+def _stored(config: KoopmanConfig) -> storage.Stored:
+    path = Path(config.file)
+    try:
+        changed = path.stat().st_mtime_ns
+    except OSError:
+        changed = 0
+    stored = _read(path, config.model, changed)
+    if abs(stored.dt - config.dataset.dt) > 1e-9:
+        raise ValueError(
+            f"koopman.file: '{path}' holds a model of steps of {stored.dt} s, koopman.dataset.dt "
+            f"is {config.dataset.dt} s"
+        )
+    return stored
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, family: str, changed: int) -> storage.Stored:
+    return storage.load(path, family)
