@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -27,7 +28,8 @@ from kjax.sim.observe import resolve
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 BATCHES = (16, 128, 1024)
-MJX_BATCHES = (128,)
+MJX_BATCHES = (16, 128, 1024)
+ENGINE_CASES = 64  # walked by both engines
 ROUNDS = 3  # of closed loop and bare engine in turn; medians of each, and of their ratios
 WALK = 0.5  # s of walking that is timed in C
 WALK_MJX = 0.25
@@ -49,15 +51,16 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
                   f"{entry['over_bare']:.3f} of the bare engine", flush=True)  # fmt: skip
     result["python_loop"] = python_loop(0.5 if quick else 4.0)
     for size in MJX_BATCHES[:1] if quick else MJX_BATCHES:
-        entry = mjx_batch(size, rounds)
+        entry = mjx_batch(size, rounds if size < 1024 else 2)
         result["mjx"][str(size)] = entry
         print(f"MJX, trot, every_step, {size}: {entry['robot_steps_per_s']:.0f} robot-steps/s, "
               f"{entry['over_bare']:.3f} of the bare one, compiled in {entry['compile_s']:.0f} s",
               flush=True)  # fmt: skip
     if not quick:
+        result |= engines_agree()
         result |= mjx_compile_times()
         result["machine_two_process_speedup"] = machine_speedup()
-        result["two_process_speedup"] = two_processes(folder)
+        result |= two_processes(folder)
     result |= headline(result)
     (folder / "table.md").write_text(table(result), encoding="utf-8")
     figure(result, folder / "figure.png")
@@ -76,7 +79,7 @@ def headline(result: dict[str, Any]) -> dict[str, float]:
         "c_every_step_over_bare": every["over_bare"],
         "c_bound_held_over_bare": bound["over_bare"],
         "c_batch_over_loop": held["robot_steps_per_s"] / result["python_loop"]["robot_steps_per_s"],
-        "mjx_closed_over_bare": list(result["mjx"].values())[-1]["over_bare"],
+        "mjx_closed_over_bare": result["mjx"].get("128", result["mjx"]["16"])["over_bare"],
     }
 
 
@@ -212,6 +215,46 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     }
 
 
+def engines_agree() -> dict[str, Any]:
+    """The same rough trots in C and on MJX in single precision: falls, and medians of the RMSE."""
+    overrides = {
+        "sim.contacts": "feet",
+        "duration": 3.0,
+        "lmpc.command_slew": 1.0,
+        "command.times": [0.0],
+        "command.velocities": [0.4],
+        "terrain.start": 0.5,
+        "terrain.end": 1.4,
+    }
+    config = load_config(RunConfig, CONFIGS / "trot_rough.toml", overrides)
+    configs = [
+        dataclasses.replace(
+            config, seed=seed, terrain=dataclasses.replace(config.terrain, seed=seed)
+        )
+        for seed in range(ENGINE_CASES)
+    ]
+    rmse, fell = {}, {}
+    for name, engine in (
+        ("c", BatchEngine(config, torques="every_step")),
+        ("mjx", MjxEngine(config, torques="every_step")),
+    ):
+        recording = engine.run(configs)
+        fell[name] = recording.fell
+        rmse[name] = np.array([row["velocity_rmse_mps"] for row in recording.metrics()], float)
+    both = ~fell["c"] & ~fell["mjx"]
+    medians = {name: float(np.median(values[both])) for name, values in rmse.items()}
+    same = int((fell["c"] == fell["mjx"]).sum())
+    print(f"both engines: the same verdict on {same} of {ENGINE_CASES} fields, median RMSE "
+          f"{medians['c']:.4f} and {medians['mjx']:.4f} m/s", flush=True)  # fmt: skip
+    return {
+        "engines_cases": ENGINE_CASES,
+        "engines_same_verdict": same,
+        "engines_falls": {name: int(values.sum()) for name, values in fell.items()},
+        "engines_rmse_median_mps": medians,
+        "engines_rmse_ratio": medians["mjx"] / medians["c"],
+    }
+
+
 def mjx_compile_times() -> dict[str, float]:
     """First call of a closed loop of 16 robots with an empty compile cache, and with a full one."""
     code = (
@@ -250,14 +293,19 @@ def machine_speedup() -> float:
     return float(np.median([once(1) / once(2) for _ in range(3)]))
 
 
-def two_processes(folder: Path) -> float:
-    """Speed of a sweep on two processes of one thread over that on one, both compiled before."""
+def two_processes(folder: Path) -> dict[str, float]:
+    """A sweep on two processes of one thread each beside one, both compiled before.
+
+    The speedup is that of walking: the sum of both rates over the rate of one, without each
+    process's first chunk, which loads the program. ``..._whole`` is that of the whole command, the
+    start of which, some 15 s, does not get shorter.
+    """
     sweep = CONFIGS / "sweeps" / "benchmark.toml"
     script = Path(__file__).with_name("sweep.py")
 
-    def once(count: int) -> float:
+    def once(count: int, *options: str) -> tuple[float, float]:
         out = folder / f"processes_{count}"
-        common = [sys.executable, str(script), str(sweep), "--threads", "1", "--restart"]
+        common = [sys.executable, str(script), str(sweep), "--threads", "1", "--restart", *options]
         clock = time.perf_counter()
         running = []
         for number in range(count):
@@ -275,11 +323,13 @@ def two_processes(folder: Path) -> float:
         texts = [process.communicate()[0] for process in running]
         if any(process.returncode for process in running):
             raise RuntimeError("\n".join(texts))
-        return time.perf_counter() - clock
+        rates = [re.findall(r"([0-9.]+) k robot-steps/s", text)[1:] for text in texts]
+        walking = sum(float(np.median([float(r) for r in own])) for own in rates if own)
+        return time.perf_counter() - clock, walking
 
-    once(1)
-    alone, together = once(1), once(2)
-    return alone / together
+    once(1, "--seeds", "64")
+    (alone, one), (together, two) = once(1), once(2)
+    return {"two_process_speedup": two / one, "two_process_speedup_whole": alone / together}
 
 
 def _cores() -> list[int]:
@@ -296,17 +346,20 @@ def _resident() -> float:
 
 def table(result: dict[str, Any]) -> str:
     """All of it as Markdown."""
-    lines = ["| engine, gait, torques, robots | robot-steps/s | bare engine | part of it |",
-             "|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| engine, gait, torques, robots | robot-steps/s | bare engine | part of it | memory, MB |",
+        "|---|---|---|---|---|",
+    ]
     rows = [(f"C, {name}", entry) for name, entry in result["c"].items()]
     rows += [(f"MJX, trot, every_step, {name}", entry) for name, entry in result["mjx"].items()]
     for name, entry in rows:
         lines.append(
             f"| {name} | {entry['robot_steps_per_s']:,.0f} | "
-            f"{entry['bare_robot_steps_per_s']:,.0f} | {entry['over_bare']:.2f} |"
+            f"{entry['bare_robot_steps_per_s']:,.0f} | {entry['over_bare']:.2f} | "
+            f"{entry['resident_MB']:,.0f} |"
         )
     alone = result["python_loop"]["robot_steps_per_s"]
-    lines.append(f"| C, trot, every step, one robot in a Python loop | {alone:,.0f} | | |")
+    lines.append(f"| C, trot, every step, one robot in a Python loop | {alone:,.0f} | | | |")
     return "\n".join(lines) + "\n"
 
 

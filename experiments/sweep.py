@@ -1,9 +1,11 @@
 """Walk a whole sweep of closed loops: a grid or a random sample of configs, times seeds.
 
-Leaves sweep.nc (labelled, xarray), manifest.json, figure.png and one file per chunk in the output
-folder. Run again, it goes on where it stopped; finished, it only draws.
+Leaves sweep.nc (labelled, xarray), summary.json and figure.png of what its [figure] asks for,
+manifest.json and one file per chunk in the output folder. Run again, it goes on where it stopped;
+finished, it only draws.
 """
 
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,8 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, help="robots at once, instead of the file's")
     parser.add_argument("--threads", type=int, help="of the C engine (default: one per core)")
     parser.add_argument("--restart", action="store_true", help="drop what the folder holds")
+    parser.add_argument("--draw", action="store_true",
+                        help="only draw the sweep.nc of a finished sweep")  # fmt: skip
     parser.add_argument("--distributed", action="store_true",
                         help="one of several processes, as Slurm or Open MPI tell")  # fmt: skip
     parser.add_argument("--coordinator", metavar="HOST:PORT",
@@ -41,11 +45,14 @@ def main() -> None:
         )
     except ConfigError as error:
         cli.fail(str(error))
+    folder = args.out or Path("results") / Path(args.config).stem
+    if args.draw:
+        draw(sweep, folder, args.config)
+        return
     cli.configure_jax()
     jax.config.update("jax_enable_x64", sweep.precision == "float64")
     barrier = start_processes(args)
     process, processes = jax.process_index(), jax.process_count()
-    folder = args.out or Path("results") / Path(args.config).stem
 
     from kjax.sweep.runner import run_sweep
     from kjax.sweep.store import StoreError
@@ -95,11 +102,27 @@ def start_processes(args: Any) -> Any:
     return multihost_utils.sync_global_devices
 
 
+def draw(sweep: SweepConfig, folder: Path, config: str) -> None:
+    """Figure and summary of a finished sweep, from its dataset alone."""
+    import xarray as xr
+
+    try:
+        with xr.open_dataset(folder / "sweep.nc") as dataset:
+            report(dataset.load(), sweep, folder)
+    except (OSError, ValueError) as error:
+        cli.fail(f"--draw: {folder / 'sweep.nc'} with {config}: {error}")
+
+
 def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
     """Draw the figure and print what came out, in one line."""
-    from kjax.viz.sweep_plots import success, sweep_figure
+    from kjax.viz.sweep_plots import success, sweep_figure, sweep_summary
 
     sweep_figure(dataset, sweep, folder / "figure.png")
+    record = {
+        "provenance": json.loads(dataset.attrs["provenance"]),
+        **sweep_summary(dataset, sweep),
+    }
+    cli.save_json(folder / "summary.json", record)
     good = success(dataset)
     print(
         f"{good.size} episodes, {int(good.sum())} succeeded, "

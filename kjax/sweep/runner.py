@@ -149,7 +149,7 @@ def _run_chunks(
                 rate = steps[number] / (time.perf_counter() - clock)
                 print(
                     f"chunk {place + 1} of {len(todo)}: {len(chunk.cases)} robots, "
-                    f"{rate / 1e3:.0f} k robot-steps/s, "
+                    f"{rate / 1e3:.1f} k robot-steps/s, "
                     f"{sum(row['fell'] for row in rows)} fell",
                     flush=True,
                 )

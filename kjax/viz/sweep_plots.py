@@ -45,8 +45,12 @@ def sweep_figure(dataset: xr.Dataset, sweep: SweepConfig, path: Path) -> None:
         for ax, metric in zip(row, wish.metrics, strict=True):
             rest = [str(d) for d in part["fell"].dims if d not in (x, y)]
             table = _table(part, metric, [name for name in (y, x) if name], rest)
-            if y:
+            if y and table[y].dtype.kind in "fiu":
                 _heat_map(ax, table, sweep, metric, x, y)
+            elif y:  # words, such as rules: a curve for each
+                for value in table[y].values:
+                    _curve(ax, table.sel({y: value}), sweep, metric, x, label=str(value))
+                ax.legend(title=_label(sweep, y), fontsize=7)
             else:
                 _curve(ax, table, sweep, metric, x)
             if panel is not None:
@@ -55,6 +59,21 @@ def sweep_figure(dataset: xr.Dataset, sweep: SweepConfig, path: Path) -> None:
         fig.suptitle(wish.title)
     fig.savefig(path, dpi=120)
     plt.close(fig)
+
+
+def sweep_summary(dataset: xr.Dataset, sweep: SweepConfig) -> dict[str, Any]:
+    """What the figure shows as numbers: values and ends of their intervals over the axes."""
+    keep = [str(dim) for dim in dataset["fell"].dims if dim != "seed"]
+    metrics = sweep.figure.metrics if sweep.figure else ("success",)
+    out: dict[str, Any] = {
+        "episodes_per_point": int(dataset.sizes["seed"]),
+        "dimensions": keep,
+        **{name: dataset[name].values for name in sweep.axes},
+    }
+    for metric in metrics:
+        table = _table(dataset, metric, keep, ["seed"])
+        out[metric] = {part: np.round(table[part].values, 5) for part in ("value", "low", "high")}
+    return out
 
 
 def success(dataset: xr.Dataset) -> xr.DataArray:
@@ -115,24 +134,37 @@ def _heat_map(ax: Any, table: xr.Dataset, sweep: SweepConfig, metric: str, x: st
     for axis, name in ((ax.xaxis, x), (ax.yaxis, y)):
         labels = [f"{v:g}" if isinstance(v, float | int) else str(v) for v in table[name].values]
         axis.set_ticks(range(len(labels)), labels)
+        if axis is ax.xaxis and len(labels) > 8:
+            ax.tick_params(axis="x", rotation=60)
         axis.set_label_text(_label(sweep, name))
-    name = "success [%]" if fraction else metric
-    ax.figure.colorbar(image, ax=ax, label=name if not fraction else "success [-]")
+    ax.figure.colorbar(image, ax=ax, label=_quantity(metric))
 
 
-def _curve(ax: Any, table: xr.Dataset, sweep: SweepConfig, metric: str, x: str) -> None:
+def _curve(
+    ax: Any, table: xr.Dataset, sweep: SweepConfig, metric: str, x: str, label: str | None = None
+) -> None:
     at = table[x].values
     if at.dtype.kind not in "fiu":
         ax.set_xticks(range(len(at)), [str(a) for a in at])
         at = np.arange(len(at))
     ax.fill_between(at, table["low"], table["high"], alpha=0.25, lw=0)
-    ax.plot(at, table["value"], "o-", ms=3)
-    ax.set(xlabel=_label(sweep, x), ylabel="success [-]" if metric == "success" else metric)
+    ax.plot(at, table["value"], "o-", ms=3, label=label)
+    ax.set(xlabel=_label(sweep, x), ylabel=_quantity(metric))
     if metric == "success":
         ax.set_ylim(-0.03, 1.03)
     else:
+        ax.relim()
+        ax.autoscale(axis="y")  # a curve before this one may have set the limits
         ax.set_ylim(bottom=0.0)
     ax.grid(alpha=0.3)
+
+
+def _quantity(metric: str) -> str:
+    """A metric's name with its unit apart: pitch_max_deg becomes "pitch max [deg]"."""
+    for suffix, unit in (("_deg", "deg"), ("_mps", "m/s"), ("_m", "m"), ("_s", "s")):
+        if metric.endswith(suffix):
+            return f"{metric.removesuffix(suffix).replace('_', ' ')} [{unit}]"
+    return f"{metric.replace('_', ' ')} [-]"
 
 
 def _label(sweep: SweepConfig, name: str) -> str:
