@@ -1,0 +1,421 @@
+"""Learn what a rigid body misses of the whole robot, from its own closed-loop episodes.
+
+Records trots and bounds of the whole Go1 in C MuJoCo with perturbed forces (flat, pushed, rough),
+fits a residual on the planted rigid body in each contact mode, and tests it on held-out episodes:
+open-loop predictions of 25 and 50 ms under the recorded forces, inside a stance and over all start
+points. Half of the episodes are fitted on, a fifth chooses between fits, and 30 % report.
+
+Leaves metrics.json, figure.png and residual_<gait>.npz in the output folder. The recordings stay
+there as well and are used again while their configs are the same.
+"""
+
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from kjax import cli, srb
+from kjax.config import RunConfig, SrbConfig, load_config, to_dict
+from kjax.koopman import open_loop, whole_body
+from kjax.koopman.whole_body import Episode, Features, Transitions
+from kjax.robots import go1
+from kjax.types import Mode
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+DT = 0.005  # s, control tick of all these configs
+HORIZONS = {"25ms": 5, "50ms": 10}  # ticks
+HELD_OUT, TUNE = 0.3, 0.2 / 0.7  # of all episodes, of those left
+STEPS = (1, 5, 10)  # ticks that a row of the fit sums over, to choose from
+
+
+class Kind(NamedTuple):
+    """Episodes of one kind: config, range of commanded speeds [m/s], other keys."""
+
+    config: str
+    speeds: tuple[float, float]
+    keys: dict[str, Any]
+
+
+KINDS = {
+    "trot": Kind("trot_velocity_long.toml", (-0.1, 0.6), {"lmpc.command_slew": 1.0}),
+    "trot_rough": Kind("trot_rough.toml", (0.15, 0.4), {}),
+    "bound": Kind("bound_multiphase.toml", (-0.1, 0.8), {}),
+    "bound_rough": Kind("bound_rough.toml", (0.5, 0.8), {}),
+}
+GAITS = {"trot": ("trot", "trot_rough"), "bound": ("bound", "bound_rough")}
+MODELS: dict[str, Features] = {
+    "affine": whole_body.affine,
+    "history": whole_body.history,
+    "clock": whole_body.clock,
+    "clock_history": whole_body.clock_history,
+    "touchdown": whole_body.touchdown(DT),
+}
+LABELS = {
+    "nominal": "rigid body, feet planted",
+    "affine": "+ affine residual",
+    "clock_history": "+ place in the phase, last force",
+    "touchdown": "+ ticks around a touchdown",
+}
+
+
+def main() -> None:
+    """Parse the command line, then record, fit and test."""
+    parser = cli.script_parser(__doc__.splitlines()[0])
+    parser.add_argument("--robots", type=int, default=64, help="episodes of each kind")
+    parser.add_argument("--duration", type=float, default=8.0, help="of an episode [s]")
+    parser.add_argument("--force", type=float, default=15.0, help="noise.force [N]")
+    parser.add_argument("--quick", action="store_true", help="10 robots, 3 s, flat ground only")
+    args = parser.parse_args()
+    if args.quick:
+        args.robots, args.duration = 10, 3.0
+    if args.robots < 10:
+        cli.fail(f"--robots: got {args.robots}, wanted at least 10")
+    if not args.duration >= 3.0:
+        cli.fail(f"--duration: got {args.duration} s, wanted at least 3 s")
+    if not args.force > 0.0:
+        cli.fail(f"--force: got {args.force} N, wanted more than 0")
+    cli.configure_jax()
+    folder = cli.output_folder(args, "whole_body")
+    metrics: dict[str, Any] = {}
+    curves: dict[str, Any] = {}
+    for gait, kinds in GAITS.items():
+        used = kinds[:1] if args.quick else kinds
+        recordings = {kind: record(kind, args, folder) for kind in used}
+        metrics[gait], curves[gait], fits = study(gait, recordings)
+        numbers = {f"W_{name}": fit.W for name, fit in fits.items()}
+        config = SrbConfig()
+        np.savez(
+            folder / f"residual_{gait}.npz",
+            W=fits["affine"].W,
+            **numbers,
+            dt=DT,
+            mass=config.mass,
+            inertia=config.inertia,
+            modes=[mode.name for mode in Mode],
+        )
+    chosen = metrics["trot"]["chosen_inside"]
+    trot = {name: metrics["trot"]["inside"][name]["50ms"]["all"] for name in (chosen, "affine")}
+    result = {
+        "residual_model": chosen,
+        "residual_velocity_ratio_50ms": trot[chosen]["velocity"]["ratio"],
+        "residual_pitch_rate_ratio_50ms": trot[chosen]["omega"]["ratio"],
+        "affine_residual_velocity_ratio_50ms": trot["affine"]["velocity"]["ratio"],
+        "affine_residual_pitch_rate_ratio_50ms": trot["affine"]["omega"]["ratio"],
+        "robots_per_kind": args.robots,
+        "duration_s": args.duration,
+        "force_noise_n": args.force,
+        **metrics,
+        "provenance": cli.provenance(),
+    }
+    cli.save_json(folder / "metrics.json", result)
+    save_figure(curves, folder / "figure.png")
+    print(f"\nresults in {folder}/")
+
+
+def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[RunConfig]:
+    """Configs of the robots of a kind: each its own speeds, and obstacles or pushes.
+
+    On flat ground every other robot is pushed.
+    """
+    chosen, configs = KINDS[kind], []
+    for seed in range(robots):
+        rng = np.random.default_rng([seed, 17])
+        times = [0.0, 1.0, *np.arange(3.0, duration, 2.0)]
+        keys = {
+            "seed": seed,
+            "duration": duration,
+            "sim.contacts": "feet",
+            "noise.force": force,
+            "command.times": times,
+            "command.velocities": [0.0, *rng.uniform(*chosen.speeds, len(times) - 1)],
+            **chosen.keys,
+        }
+        if kind.endswith("rough"):
+            keys["terrain.seed"] = seed
+        elif seed % 2:
+            early = np.arange(1.5, duration - 1.0, 2.0)
+            at = np.round(early + rng.uniform(0.0, 1.0, len(early)), 3)
+            keys["push.times"] = list(at)
+            keys["push.forward"] = list(rng.uniform(-4.0, 4.0, len(at)))
+        configs.append(load_config(RunConfig, CONFIGS / chosen.config, keys))
+    return configs
+
+
+def record(kind: str, args: Any, folder: Path) -> list[Episode]:
+    """Episodes of a kind, from the folder where they lie there already."""
+    from kjax.sim.batch_loop import BatchEngine
+
+    configs = kind_configs(kind, args.robots, args.duration, args.force)
+    wanted = json.dumps([to_dict(config) for config in configs], sort_keys=True)
+    path = folder / f"episodes_{kind}.npz"
+    if path.exists():
+        with np.load(path) as data:
+            if str(data["configs"]) == wanted:
+                print(
+                    f"{kind}: {args.robots} episodes of {args.duration:g} s are there", flush=True
+                )
+                return _episodes({name: data[name] for name in data.files})
+    print(f"{kind}: recording {args.robots} episodes of {args.duration:g} s ...", flush=True)
+    begin = time.perf_counter()
+    run = BatchEngine(configs[0], torques="held").run(configs)
+    if run.interrupted:
+        raise KeyboardInterrupt
+    log, steps = run.log, np.arange(len(run.log.x)) * DT
+    disturbed = np.zeros(log.stance.shape[:2], bool)
+    for robot, config in enumerate(configs):
+        for at in config.push.times:
+            # A tick that a push reaches into counts.
+            disturbed[:, robot] |= (steps > at - DT) & (steps < at + config.push.duration)
+    arrays = {
+        **{name: getattr(log, name) for name in ("x", "feet", "force", "stance", "foot_force")},
+        "disturbed": disturbed,
+        "ticks": run.ticks,
+        "fell": run.fell,
+    }
+    scratch = path.with_suffix(".part.npz")
+    np.savez_compressed(scratch, configs=wanted, **arrays)
+    scratch.replace(path)
+    print(f"  {run.fell.sum()} falls, {time.perf_counter() - begin:.0f} s", flush=True)
+    return _episodes(arrays)
+
+
+def _episodes(arrays: dict[str, np.ndarray]) -> list[Episode]:
+    return [
+        Episode(**{name: arrays[name][:count, robot] for name in Episode._fields})
+        for robot, count in enumerate(arrays["ticks"])
+    ]
+
+
+def study(
+    gait: str, recordings: dict[str, list[Episode]]
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, whole_body.Fit]]:
+    """Fit and test the models of a gait.
+
+    Returns:
+      Metrics; error curves over time; the fits.
+    """
+    config = SrbConfig()
+    body = srb.SrbParams(
+        mass=jnp.asarray(config.mass), inertia=jnp.asarray(config.inertia), feet=jnp.zeros((2, 2))
+    )
+    subset: dict[int, str] = {}
+    episodes: list[Episode] = []
+    for kind, those in recordings.items():
+        for episode in those:
+            flat = "pushed" if episode.disturbed.any() else "flat"
+            subset[len(subset)] = "rough" if kind.endswith("rough") else flat
+            episodes.append(episode)
+    numbers = np.arange(len(episodes))
+    rest, report = whole_body.split(numbers, share=HELD_OUT)
+    train, tune = whole_body.split(rest, share=TUNE, seed=1)
+    data = whole_body.transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
+    fitted, tuned, held = (data.rows(np.isin(data.episode, own)) for own in (train, tune, report))
+    print(f"{gait}: {len(train)}, {len(tune)} and {len(report)} episodes to fit, choose and "
+          f"report, {len(fitted.x)} rows to fit", flush=True)  # fmt: skip
+    landing = open_loop.fit_landing(fitted)
+    out: dict[str, Any] = {
+        "episodes": {"fit": train, "choose": tune, "report": report},
+        "fit": {},
+        "inside": {},
+        "all_starts": {},
+    }
+    fits: dict[str, whole_body.Fit] = {}
+    scores: dict[str, float] = {}
+    for name, features in MODELS.items():
+        everywhere = name == "touchdown"
+        fits[name], steps, score = _choose(
+            fitted, tuned, body, features, landing if everywhere else None, everywhere
+        )
+        if not everywhere:
+            scores[name] = score
+        gains = whole_body.force_gains(fits[name], fitted, body, dt=DT, features=features)
+        out["fit"][name] = {"steps": steps, **_fit_report(fits[name], gains)}
+    out["chosen_inside"] = min(scores, key=scores.__getitem__)
+    curves: dict[str, Any] = {}
+    for where, schemes in (("inside", ("",)), ("all_starts", ("frozen", "scheduled"))):
+        for horizon, length in HORIZONS.items():
+            views = open_loop.windows(held, length, inside=where == "inside", stride=2)
+            kinds, calm = np.array([subset[n] for n in views.episode]), ~views.disturbed
+            groups = {"all": calm}
+            groups |= {kind: calm & (kinds == kind) for kind in sorted(set(subset.values()))}
+            groups["all, no foot slips"] = calm & views.still
+            groups["all, during pushes as well"] = calm | True
+            reference = None
+            for scheme in schemes:
+                down = landing if scheme == "scheduled" else None
+                base = _errors(views, body, None, None, down)
+                reference = base if reference is None else reference
+                for name in ("nominal", *MODELS):
+                    fit = fits.get(name)
+                    errors = base if fit is None else _errors(views, body, fit, MODELS[name], down)
+                    full_name = f"{scheme} {name}".strip()
+                    entry: dict[str, Any] = {"windows": int(calm.sum())}
+                    for group, rows in groups.items():
+                        if rows.any():
+                            entry[group] = _ratios(errors, base, views.episode, rows)
+                    if scheme == "scheduled":
+                        entry["all, against the frozen nominal"] = _ratios(
+                            errors, reference, views.episode, calm
+                        )
+                    out[where].setdefault(full_name, {})[horizon] = entry
+                    if length == max(HORIZONS.values()):
+                        curves[where, full_name] = {
+                            key: np.sqrt(value[calm].mean(axis=0)) for key, value in errors.items()
+                        }
+        _print(gait, where, out[where])
+    return out, curves, fits
+
+
+def _choose(
+    fitted: Transitions,
+    tuned: Transitions,
+    body: srb.SrbParams,
+    features: Features,
+    landing: open_loop.Landing | None,
+    everywhere: bool,
+) -> tuple[whole_body.Fit, int, float]:
+    """The fit, of those over 1, 5 and 10 ticks, that predicts the tuning episodes best.
+
+    Returns:
+      The fit, its ticks, and its score: the product of the ratios of squared errors to the nominal
+      at the longest horizon.
+    """
+    length = max(HORIZONS.values())
+    views = open_loop.windows(tuned, length, inside=not everywhere, stride=3)
+    calm = ~views.disturbed
+    base = _errors(views, body, None, None, landing)
+    best: tuple[float, whole_body.Fit, int] | None = None
+    for steps in STEPS:
+        fit = whole_body.fit(
+            fitted,
+            body,
+            dt=DT,
+            features=features,
+            rows=~fitted.disturbed if everywhere else None,
+            steps=steps,
+        )
+        errors = _errors(views, body, fit, features, landing)
+        ratios = [_at_end(errors[k], calm) / _at_end(base[k], calm) for k in ("velocity", "omega")]
+        score = ratios[0] * ratios[1]
+        if best is None or score < best[0]:
+            best = score, fit, steps
+    assert best is not None
+    return best[1], best[2], best[0]
+
+
+def _at_end(squared: np.ndarray, rows: np.ndarray) -> float:
+    return float(squared[rows, -1].mean())
+
+
+def _errors(
+    views: open_loop.Windows,
+    body: srb.SrbParams,
+    fit: whole_body.Fit | None,
+    features: Features | None,
+    landing: open_loop.Landing | None,
+) -> dict[str, np.ndarray]:
+    W = None if fit is None else fit.W
+    own = whole_body.affine if features is None else features
+    predicted = open_loop.predict(views, body, dt=DT, W=W, features=own, landing=landing)
+    return open_loop.squared_errors(views, predicted)
+
+
+def _ratios(
+    errors: dict[str, np.ndarray],
+    base: dict[str, np.ndarray],
+    episode: np.ndarray,
+    rows: np.ndarray,
+) -> dict[str, Any]:
+    """Root-mean-square errors at the end, and their ratio to the nominal's with its interval."""
+    out: dict[str, Any] = {}
+    for name, squared in errors.items():
+        ratio, low, high = open_loop.rms_ratio(
+            squared[rows, -1:], base[name][rows, -1:], episode[rows]
+        )[:, 0]
+        rms = np.sqrt(squared[rows, -1].mean())
+        out[name] = {"ratio": ratio, "interval": [low, high], "rms": rms}
+    return out
+
+
+def _fit_report(fit: whole_body.Fit, gains: np.ndarray) -> dict[str, Any]:
+    """How well each contact mode's weights were determined."""
+    return {
+        mode.name.lower(): {
+            "rows": fit.rows[mode],
+            "rank": fit.rank[mode],
+            "columns": fit.columns[mode],
+            "condition": fit.condition[mode],
+            "force_gain_x_z": gains[mode],
+            "one_step_residual_rms_before": fit.before[mode],
+            "one_step_residual_rms_after": fit.after[mode],
+        }
+        for mode in Mode
+        if fit.rows[mode] > 0
+    }
+
+
+def _print(gait: str, where: str, table: dict[str, Any]) -> None:
+    print(f"\n{gait}, {where.replace('_', ' ')}: error over that of the same scheme's nominal "
+          "[95 %], held-out episodes")  # fmt: skip
+    print(f"  {'':24}{'':6}{'velocity':>22}{'pitch rate':>22}")
+    for name, horizons in table.items():
+        for horizon, entry in horizons.items():
+            cells = []
+            for key, unit in (("velocity", "m/s"), ("omega", "rad/s")):
+                one = entry["all"][key]
+                low, high = one["interval"]
+                text = f"{one['rms']:.3f} {unit}"
+                if not name.endswith("nominal"):
+                    text = f"{one['ratio']:.3f} [{low:.3f} {high:.3f}]"
+                cells.append(f"{text:>22}")
+            print(f"  {name:24}{horizon:6}{''.join(cells)}", flush=True)
+
+
+def save_figure(curves: dict[str, Any], path: Path) -> None:
+    """Root-mean-square error against the horizon, inside a stance and over all start points.
+
+    Over all start points the predictions follow the schedule, but for the dashed one.
+    """
+    from kjax.viz import plots
+    from kjax.viz.plots import plt
+
+    colours = {"nominal": plots.DARK, "affine": plots.BLUE, "clock_history": "#2f855a",
+               "touchdown": plots.RED}  # fmt: skip
+    columns = [(gait, where) for gait in curves for where in ("inside", "all_starts")]
+    with plt.rc_context(plots.STYLE | {"lines.linewidth": 1.3}):
+        fig, axes = plt.subplots(
+            2, len(columns), figsize=(2.3 * len(columns), 4.6), sharex=True, squeeze=False
+        )
+        for column, (gait, where) in zip(axes.T, columns, strict=True):
+            scheme = "" if where == "inside" else "scheduled "
+            for axis, key in zip(column, ("velocity", "omega"), strict=True):
+                for name, colour in colours.items():
+                    if name == "touchdown" and where == "inside":
+                        continue
+                    curve = curves[gait][where, scheme + name][key]
+                    time_ms = 1e3 * DT * np.arange(1, len(curve) + 1)
+                    axis.plot(time_ms, curve, "o-", ms=2.5, color=colour, label=LABELS[name])
+                if where == "all_starts":
+                    frozen = curves[gait][where, "frozen nominal"][key]
+                    axis.plot(time_ms, frozen, "--", color=plots.GREY,
+                              label="rigid body, present feet kept")  # fmt: skip
+                # Feet kept through a bound's flight would press all others flat.
+                highest = curves[gait][where, scheme + "nominal"][key][-1]
+                axis.set_ylim(0.0, 1.1 * highest if where == "inside" else 1.5 * highest)
+            place = "inside a stance" if where == "inside" else "all start points"
+            column[0].set_title(f"{gait}, {place}", loc="left", fontsize=8)
+            column[1].set_xlabel("horizon [ms]")
+        axes[0, 0].set_ylabel("velocity error, rms [m/s]")
+        axes[1, 0].set_ylabel("pitch rate error, rms [rad/s]")
+        handles, labels = axes[0, 1].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="lower center", ncol=3)
+        fig.tight_layout(rect=(0.0, 0.1, 1.0, 1.0))
+        fig.savefig(path, dpi=160)
+        plt.close(fig)
+
+
+if __name__ == "__main__":
+    cli.run(main)
