@@ -69,7 +69,7 @@ class PushConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class NoiseConfig:
-    """Sensor noise (white, each physics step) and spread of the initial state; 1 sigma each."""
+    """Sensor noise (white, each physics step), initial spread, random forces; 1 sigma each."""
 
     enabled: bool = True
     """Whether noise and initial spread are applied [-]."""
@@ -91,6 +91,8 @@ class NoiseConfig:
     """Trunk velocity at the start [m/s]."""
     initial_pitch_rate: NonNegative = 0.2
     """Trunk pitch rate at the start [rad/s]."""
+    force: NonNegative = 0.0
+    """Forces of the standing legs, drawn anew at every control tick [N]."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

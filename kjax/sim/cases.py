@@ -28,6 +28,7 @@ from kjax.config import (
 )
 from kjax.params import ControllerParams, build_gaits, build_params, cycle_nodes
 from kjax.robots import go1
+from kjax.sim.excitation import force_deviation, without_size
 from kjax.sim.observe import noise_scale
 from kjax.sim.push import impulses
 from kjax.types import Command
@@ -55,6 +56,7 @@ class Case(NamedTuple):
     Attributes:
       seed: of the noise.
       noise_scale: (n,) standard deviation of each entry of the noise vector.
+      force_noise: standard deviation of what is added to planned forces [N].
       push_begin: (P,) physics step at which each push begins.
       push_steps: (P,) number of steps it lasts; 0 for none.
       push_force: (P, 3) force on the trunk meanwhile, world [N].
@@ -63,6 +65,7 @@ class Case(NamedTuple):
 
     seed: Any
     noise_scale: Any
+    force_noise: Any
     push_begin: Any
     push_steps: Any
     push_force: Any
@@ -98,7 +101,7 @@ def batch_part(config: RunConfig) -> BatchPart:
         duration=1.0,
         command=CommandConfig(times=(0.0,), velocities=(0.0,)),
         gait=plain_gait,
-        noise=NoiseConfig(enabled=config.noise.enabled),
+        noise=NoiseConfig(enabled=config.noise.enabled, force=without_size(config.noise)),
         push=PushConfig(),
         srb=SrbConfig(),
         leg=LegConfig(),
@@ -133,6 +136,7 @@ def stack_cases(configs: Sequence[RunConfig]) -> Case:
         return Case(
             seed=np.int32(config.seed),
             noise_scale=noise_scale(config.noise, config.sim.base).astype(np.float32),
+            force_noise=np.float32(force_deviation(config.noise)),
             push_begin=begin,
             push_steps=length,
             push_force=rows,

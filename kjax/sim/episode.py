@@ -15,6 +15,7 @@ from kjax.legs.base import build_base
 from kjax.params import build_gaits
 from kjax.robots import go1
 from kjax.sim import free_base
+from kjax.sim.excitation import without_size
 from kjax.sim.observe import NOISE_DIM, Observe, noise_dim, noise_scale
 
 FALL_HEIGHT = 0.12  # m, centre of mass; about the trunk lying on the ground
@@ -98,16 +99,16 @@ class Trajectory:
 def fixed_part(config: RunConfig) -> RunConfig:
     """The config without what may differ between the episodes of one compiled simulation.
 
-    That is the seed, duration, noise, pushes, times and speeds of the command, times of the gaits,
-    friction, payload, delay, and the terrain's seed and sizes. Configs with the same fixed part
-    share a ``mujoco_loop.Simulation``.
+    That is the seed, duration, noise (but for whether it perturbs forces), pushes, times and speeds
+    of the command, times of the gaits, friction, payload, delay, and the terrain's seed and sizes.
+    Configs with the same fixed part share a ``mujoco_loop.Simulation``.
     """
     pieces = tuple(map(float, range(len(config.command.times))))
     return replace(
         config,
         seed=0,
         duration=1.0,
-        noise=NoiseConfig(),
+        noise=NoiseConfig(force=without_size(config.noise)),
         push=PushConfig(),
         command=CommandConfig(times=pieces, velocities=pieces),
         gait=replace(config.gait, times=tuple(map(float, range(len(config.gait.times))))),

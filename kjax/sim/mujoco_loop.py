@@ -27,6 +27,7 @@ from kjax.sim.episode import (
     sagittal,
     sensor_noise,
 )
+from kjax.sim.excitation import force_deviation, force_noise, perturb
 from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, noise_dim, resolve
 from kjax.sim.push import push_force, pushed_body
 from kjax.sim.scene import build_model, dress, foot_geoms
@@ -86,9 +87,10 @@ def requests(config: RunConfig) -> Requests:
 class Simulation(NamedTuple):
     """Everything compiled and built for one config, and for all with the same ``fixed_part``.
 
-    The jitted calls take one flat vector of sensor values (qpos, qvel, sensordata, noise) and keep
-    the controller state and the episode's requests in another: passing pytrees costs 2 us per leaf
-    and call, more than the controller itself.
+    The jitted calls take one flat vector of sensor values (qpos, qvel, sensordata, noise, and where
+    forces are perturbed what is added to them) and keep the controller state and the episode's
+    requests in another: passing pytrees costs 2 us per leaf and call, more than the controller
+    itself.
 
     Attributes:
       config: it was built from.
@@ -120,10 +122,12 @@ def build_simulation(config: RunConfig) -> Simulation:
     model = build_model(config.sim, config.terrain)
     observe = build_observe(model, config.sim.contact_threshold)
     controller, params = build_controller(config), build_params(config, go1.PARAMS)
-    cuts = np.cumsum([model.nq, model.nv, model.nsensordata])
+    parts = (model.nq, model.nv, model.nsensordata, noise_dim(config.sim.base))
+    cuts, size = np.cumsum(parts[:-1]), sum(parts)
+    excited = force_deviation(config.noise) > 0
 
     def sense(sensed: Array) -> Observation:
-        qpos, qvel, sensordata, noise = jnp.split(sensed, cuts)
+        qpos, qvel, sensordata, noise = jnp.split(sensed[:size], cuts)
         return add_noise(observe(qpos, qvel, sensordata), noise)
 
     def pack(tree: LoopState | TickLog) -> Array:
@@ -149,6 +153,8 @@ def build_simulation(config: RunConfig) -> Simulation:
 
     def plan_log(loop: LoopState, sensed: Array) -> tuple[LoopState, TickLog]:
         state, info = controller.plan(asked(loop.requests), loop.controller, sense(sensed))
+        if excited:
+            state = state._replace(force=perturb(state.force, state.stance, sensed[size:]))
         log = TickLog(
             gait=state.clock.gait,
             stance=state.stance,
@@ -174,7 +180,7 @@ def build_simulation(config: RunConfig) -> Simulation:
         return pack(loop._replace(controller=state)), torque.reshape(-1)
 
     dtype = params.position_slack.dtype
-    example = jax.ShapeDtypeStruct((cuts[-1] + noise_dim(config.sim.base),), dtype)
+    example = jax.ShapeDtypeStruct((size + 4 * excited,), dtype)
     default = requests(config)
     state_like = jax.eval_shape(begin, example, default)
     jitted_init = jax.jit(init)
@@ -266,14 +272,16 @@ def simulate(
     # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
     piece = _NOISE_TICKS * per_tick
     noise = sensor_noise(config, piece)
-    sensed = np.zeros(model.nq + model.nv + model.nsensordata + noise.shape[1])
-    cuts = np.cumsum([model.nq, model.nv, model.nsensordata])
+    cuts = np.cumsum([model.nq, model.nv, model.nsensordata, noise.shape[1]])
+    excited = force_deviation(config.noise) > 0
+    added = force_noise(config, ticks) if excited else np.zeros((ticks, 0))
+    sensed = np.zeros(cuts[-1] + added.shape[1])
 
     def sense(step: int) -> np.ndarray:
         sensed[: cuts[0]] = data.qpos
         sensed[cuts[0] : cuts[1]] = data.qvel
         sensed[cuts[1] : cuts[2]] = data.sensordata
-        sensed[cuts[2] :] = noise[step % piece]
+        sensed[cuts[2] : cuts[3]] = noise[step % piece]
         return sensed
 
     qpos, qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
@@ -298,6 +306,7 @@ def simulate(
             if tick > 0 and tick % _NOISE_TICKS == 0:
                 noise = sensor_noise(config, piece, tick * per_tick)
             sense(tick * per_tick)
+            sensed[cuts[3] :] = added[tick]
             clock = time.perf_counter()
             state, log = simulation.plan(state, sensed)
             logs.append(np.asarray(log))

@@ -20,6 +20,7 @@ from kjax.legs.base import build_base
 from kjax.params import ControllerParams
 from kjax.sim.cases import Case
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
+from kjax.sim.excitation import force_deviation, force_row, perturb
 from kjax.sim.observe import add_noise, build_observe
 from kjax.types import Observation
 
@@ -100,6 +101,7 @@ def build_walk(
     observe = build_observe(model, config.sim.contact_threshold)
     touch = [model.sensor_adr[model.sensor(f"{leg}_foot").id] for leg in ("FR", "FL", "RR", "RL")]
     order = np.argsort(actuators.reshape(-1))
+    excited = force_deviation(config.noise) > 0
 
     def see(sensed: Sensed) -> Observation:
         return observe(
@@ -126,6 +128,9 @@ def build_walk(
         params: ControllerParams, case: Case, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, TickLog]:
         moved, info = controller.plan(params, state.controller, sense(case, step, sensed))
+        if excited:
+            added = case.force_noise * force_row(case.seed, step)
+            moved = moved._replace(force=perturb(moved.force, moved.stance, added))
         true = see(sensed)
         body = base.view(params.robot, state.track, true).planar
         log = TickLog(

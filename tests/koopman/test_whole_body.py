@@ -54,6 +54,8 @@ def walk(seed, body, W, *, phases=4, lost=()):
         offset = np.array([0.19, 0.19, -0.18, -0.18]) + 0.05 * rng.normal(size=4)
         fresh = np.stack([x[t, 0] + offset, np.full(4, SOLE) + 0.01 * rng.normal(size=4)], axis=1)
         feet[t] = np.where(stance[t, :, None] & (not moved), feet[t - 1], fresh)
+        if moved and t > 0:  # feet that lift do so after the sample that ends their last tick
+            feet[t] = np.where(stance[t, :, None], fresh, feet[t - 1])
         ends = np.array([0.0, 62.0]) + 20.0 * rng.normal(size=(2, 2))
         force[t] = np.where(stance[t, :, None], np.repeat(ends, 2, axis=0), 0.0)
         front, rear = (feet[t, legs][stance[t, legs]][0] for legs in (slice(0, 2), slice(2, 4)))
@@ -142,19 +144,22 @@ def test_place_in_the_gait_and_forces_are_those_of_the_schedule(data, episodes):
     np.testing.assert_allclose(one.x_next[:-1], one.x[1:])
 
 
-def test_a_lost_contact_and_an_early_one_are_marked(body, weights):
+def test_lost_early_and_slipping_contacts_are_marked(body, weights):
     whole = walk(0, body, weights, lost=[(5, 0)])  # a stance leg, seen at the end of tick 4
     touch = np.array(whole.foot_force)
     touch[20, 3] = 50.0  # a leg in the air
+    feet = np.array(whole.feet)
+    feet[29:37, 3] += [0.01, 0.0]  # slips in tick 28, and stays there until it lifts
     touch[PHASE - 1, 1] = 50.0  # lands a tick early
     disturbed = np.arange(len(whole.x)) == 30
     seen = whole_body.transitions(
-        [whole._replace(foot_force=touch, disturbed=disturbed)], dt=DT, sole=SOLE
+        [whole._replace(feet=feet, foot_force=touch, disturbed=disturbed)], dt=DT, sole=SOLE
     )
     changes = {PHASE, 2 * PHASE, 3 * PHASE}  # where the sensors still show the feet before
     assert set(np.flatnonzero(~seen.held)) == {4, 5} | changes
     assert set(np.flatnonzero(~seen.clear)) == {10, 11, 19, 20} | changes
-    assert not seen.planted[[4, 5, 19, 20, 30]].any()
+    assert np.flatnonzero(~seen.still).tolist() == [28]
+    assert not seen.planted[[4, 5, 19, 20, 28, 30]].any()
     inside = open_loop.windows(seen, 3, inside=True)
     assert inside.disturbed.sum() == 3  # they are kept, and told
     begins = np.round(inside.moment.elapsed[:, 0] / DT).astype(int)
@@ -167,9 +172,11 @@ def test_an_idle_end_gets_no_weight(body):
     ticks = 400
     front = np.tile([True, True, False, False], (ticks, 1))
     front[-1:] = True
+    feet = rng.normal(size=(ticks, 4, 2))
+    feet[:, :2] = [0.2, 0.0]
     episode = Episode(
         x=0.1 * rng.normal(size=(ticks, 6)),
-        feet=rng.normal(size=(ticks, 4, 2)),
+        feet=feet,
         force=np.where(front[..., None], rng.normal(size=(ticks, 4, 2)), 7.0),
         stance=front,
         foot_force=60.0 * front,

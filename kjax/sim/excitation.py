@@ -1,0 +1,58 @@
+"""Planned forces, perturbed: what a robot must do for its model to be told from its feedback.
+
+A walking robot's forces follow from its state, so that its episodes alone do not say what a force
+does. Each control tick adds a random force to the planned ones of the standing legs; both legs of
+an end get the same, as the models know one force per end. What the planner remembers stays as it
+planned it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from kjax.config import NoiseConfig, RunConfig
+
+_STREAM = 3  # of random numbers; 1 and 2 are those of ``episode.noise_row``
+
+
+def force_deviation(noise: NoiseConfig) -> float:
+    """Standard deviation of the added forces [N], 0 where noise is off."""
+    return noise.force * noise.enabled
+
+
+def without_size(noise: NoiseConfig) -> float:
+    """A value of ``noise.force`` that says only whether forces are perturbed: 1 or 0."""
+    return float(force_deviation(noise) > 0)
+
+
+def force_row(seed: Int[Array, ""], step: Int[Array, ""]) -> Float[Array, "4"]:
+    """Standard normal vector (front x, z, rear x, z) of the tick that begins at a physics step."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), _STREAM), step)
+    return jax.random.normal(key, (4,), jnp.float32)
+
+
+_force_rows = jax.jit(jax.vmap(force_row, in_axes=(None, 0)))
+
+
+def force_noise(config: RunConfig, ticks: int) -> Float[np.ndarray, "ticks 4"]:
+    """Forces [N] that an episode adds at its control ticks."""
+    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    steps = np.arange(ticks, dtype=np.int32) * np.int32(per_tick)
+    rows = np.asarray(_force_rows(np.int32(config.seed), steps))
+    return rows * np.float32(force_deviation(config.noise))
+
+
+def perturb(
+    force: Float[Array, "4 2"], stance: Bool[Array, "4"], noise: Float[Array, "4"]
+) -> Float[Array, "4 2"]:
+    """Forces on the legs with a random part; the ground still only pushes.
+
+    Args:
+      force: planned (x, z) on each leg, body frame [N].
+      stance: legs that stand; the others get nothing.
+      noise: added (x, z) at the front and the rear [N].
+    """
+    added = force + jnp.repeat(noise.astype(force.dtype).reshape(2, 2), 2, axis=0)
+    added = added.at[:, 1].max(0.0)
+    return jnp.where(stance[:, None], added, force)
