@@ -49,7 +49,7 @@ def main() -> None:
     if args.draw:
         draw(sweep, folder, args.config)
         return
-    cli.configure_jax()
+    cli.configure_jax(parallel=sweep.engine == "mjx")
     jax.config.update("jax_enable_x64", sweep.precision == "float64")
     barrier = start_processes(args)
     process, processes = jax.process_index(), jax.process_count()

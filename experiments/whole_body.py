@@ -5,8 +5,10 @@ fits a residual on the planted rigid body in each contact mode, and tests it on 
 open-loop predictions of 25 and 50 ms under the recorded forces, inside a stance and over all start
 points. Half of the episodes are fitted on, a fifth chooses between fits, and 30 % report.
 
-Leaves metrics.json, figure.png and residual_<gait>.npz in the output folder. The recordings stay
-there as well and are used again while their configs are the same.
+Leaves metrics.json (ratios), details.json, figure.png and, for each gait, residual_<gait>.npz (the
+affine residual, for koopman.model = "residual" with koopman.dataset.dt = 0.005) and
+weights_<gait>.npz (all models). The recordings stay there as well and are used again while their
+configs are the same.
 """
 
 import json
@@ -19,7 +21,7 @@ import numpy as np
 
 from kjax import cli, srb
 from kjax.config import RunConfig, SrbConfig, load_config, to_dict
-from kjax.koopman import open_loop, whole_body
+from kjax.koopman import open_loop, storage, whole_body
 from kjax.koopman.whole_body import Episode, Features, Transitions
 from kjax.robots import go1
 from kjax.types import Mode
@@ -85,17 +87,13 @@ def main() -> None:
         used = kinds[:1] if args.quick else kinds
         recordings = {kind: record(kind, args, folder) for kind in used}
         metrics[gait], curves[gait], fits = study(gait, recordings)
-        numbers = {f"W_{name}": fit.W for name, fit in fits.items()}
-        config = SrbConfig()
-        np.savez(
+        affine = fits["affine"]
+        storage.save(
             folder / f"residual_{gait}.npz",
-            W=fits["affine"].W,
-            **numbers,
-            dt=DT,
-            mass=config.mass,
-            inertia=config.inertia,
-            modes=[mode.name for mode in Mode],
+            storage.Stored("residual", DT, affine.W, np.nan_to_num(affine.after)),
         )
+        weights = {name: fit.W for name, fit in fits.items()}
+        np.savez(folder / f"weights_{gait}.npz", dt=DT, **weights)
     chosen = metrics["trot"]["chosen_inside"]
     trot = {name: metrics["trot"]["inside"][name]["50ms"]["all"] for name in (chosen, "affine")}
     result = {
@@ -107,12 +105,33 @@ def main() -> None:
         "robots_per_kind": args.robots,
         "duration_s": args.duration,
         "force_noise_n": args.force,
-        **metrics,
+        **{gait: compact(entry) for gait, entry in metrics.items()},
         "provenance": cli.provenance(),
     }
     cli.save_json(folder / "metrics.json", result)
+    cli.save_json(folder / "details.json", metrics)
     save_figure(curves, folder / "figure.png")
     print(f"\nresults in {folder}/")
+
+
+def compact(entry: dict[str, Any]) -> dict[str, Any]:
+    """Ratios with their intervals, rms of the nominals: [velocity, pitch rate] for each model."""
+    out: dict[str, Any] = {}
+    for where in ("inside", "all_starts"):
+        for name, horizons in entry[where].items():
+            for horizon, groups in horizons.items():
+                for group, errors in groups.items():
+                    if not isinstance(errors, dict):
+                        continue
+                    place = out.setdefault(f"{where}, {horizon}, {group}", {})
+                    both = [errors["velocity"], errors["omega"]]
+                    if name.endswith("nominal"):
+                        place[f"{name}, rms"] = [round(float(e["rms"]), 5) for e in both]
+                    else:
+                        place[name] = [
+                            [round(float(v), 4) for v in (e["ratio"], *e["interval"])] for e in both
+                        ]
+    return out
 
 
 def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[RunConfig]:

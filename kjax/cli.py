@@ -175,21 +175,28 @@ def _type_name(annotation: Any) -> str:
     return getattr(annotation, "__name__", "VALUE").upper()
 
 
-def configure_jax(*, one_core: bool = False, core: int | None = None) -> None:
+def configure_jax(
+    *, one_core: bool = False, core: int | None = None, parallel: bool = False
+) -> None:
     """JAX as the experiments want it: float64, compile cache on disk, synchronous dispatch.
+
+    Call it before anything is computed.
 
     Args:
       one_core: bind the process to one core. A single robot's controller is many small kernels,
         which waking a second thread only delays.
       core: which of the cores that the process may use, counted round; by the process id if None.
+      parallel: let XLA spread single operations over the cores, which large batches on MJX and
+        large fits gain by. A controller's small kernels take up to four times as long then.
     """
     if one_core and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         number = os.getpid() if core is None else core
         os.sched_setaffinity(0, {cores[number % len(cores)]})
-    # jaxlib spreads a batch of LAPACK calls over the pool that it runs them in, and waits: with as
-    # many of them at once as the pool has threads, nothing moves any more. So make it a large one.
-    os.environ.setdefault("NPROC", str(max(8, 4 * (os.cpu_count() or 1))))
+    # A pool of one thread spares small kernels the handing over. Where there are more, jaxlib
+    # spreads a batch of LAPACK calls over the pool that it runs them in, and waits: with as many of
+    # these at once as the pool has threads, nothing moves any more. So make it one or many.
+    os.environ.setdefault("NPROC", str(max(8, 4 * (os.cpu_count() or 1))) if parallel else "1")
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

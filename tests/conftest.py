@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("NPROC", "16")  # see kjax.cli.configure_jax
+os.environ.setdefault("NPROC", "1")  # see kjax.cli.configure_jax
 
 import chex
 import jax

@@ -6,7 +6,12 @@ import runpy
 import matplotlib.pyplot as plt
 import pytest
 
-NOTEBOOKS = ("1_the_papers_fit", "2_what_lifting_buys", "4_your_own_simulator")
+NOTEBOOKS = (
+    "1_the_papers_fit",
+    "2_what_lifting_buys",
+    "3_residual_models",
+    "4_your_own_simulator",
+)
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.koopman import families, open_loop, whole_body
+from kjax.koopman import families, open_loop, storage, whole_body
 from kjax.koopman.whole_body import Episode
 from kjax.types import MODE_ALPHA, Mode
 
@@ -275,17 +275,21 @@ def test_the_experiment_runs_and_records_once(repository, tmp_path):
     assert "recording" in first
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
-        "metrics.json", "figure.png", "residual_trot.npz", "residual_bound.npz",
-        "episodes_trot.npz", "episodes_bound.npz",
+        "metrics.json", "details.json", "figure.png", "residual_trot.npz", "residual_bound.npz",
+        "weights_trot.npz", "weights_bound.npz", "episodes_trot.npz", "episodes_bound.npz",
     }  # fmt: skip
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     # Ten short episodes already: the limits of the whole study with some room.
     assert 0.0 < metrics["residual_velocity_ratio_50ms"] < 0.35
     assert 0.0 < metrics["residual_pitch_rate_ratio_50ms"] < 0.85
-    with np.load(tmp_path / "residual_trot.npz") as numbers:
-        assert numbers["W"].shape == (len(Mode), 6, 17)
-        assert numbers["W"][Mode.TROT].any()
-        assert not numbers["W"][Mode.REAR].any()
-    with np.load(tmp_path / "residual_bound.npz") as numbers:
-        assert numbers["W"][Mode.FRONT].any()
+    trot, bound = (
+        storage.load(tmp_path / f"residual_{gait}.npz", "residual") for gait in ("trot", "bound")
+    )
+    assert trot.numbers.shape == (len(Mode), 6, 17)
+    assert trot.numbers[Mode.TROT].any()
+    assert not trot.numbers[Mode.REAR].any()
+    assert bound.numbers[Mode.FRONT].any()
+    # One tick's error of the velocity after 5 ms: millimetres per second.
+    assert (trot.spread[Mode.TROT, 3:5] > 1e-4).all()
+    assert (trot.spread[Mode.TROT, 3:5] < 2e-2).all()
     assert "recording" not in run()

@@ -1,0 +1,231 @@
+"""Does a better prediction walk better? Every prediction model in closed loop, weights tuned alike.
+
+For each gait and model the same number of random weight sets is tried on tuning seeds, and the best
+one reports on other seeds, beside the config's own weights. Leaves metrics.json, table.md and
+figure.png in the output folder. Every model is kept as it ends: the same command goes on.
+"""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kjax import cli
+from kjax.config import RunConfig, load_config
+from kjax.episodes import code_version
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
+SPEEDS = {"trot": (0.0, 0.3, 0.6), "bound": (0.0, 0.5, 0.8)}  # m/s, one after the other
+MODELS: dict[str, dict[str, Any]] = {
+    "linear (the paper)": {"koopman.model": "linear"},
+    "linear, measured feet": {"koopman.model": "linear", "koopman.feet": "measured"},
+    "SRB at hover": {"koopman.model": "srb_hover", "koopman.feet": "measured"},
+    "SRB re-linearised": {"koopman.model": "srb", "koopman.feet": "measured"},
+    "planted SRB": {"koopman.model": "planted", "koopman.feet": "measured"},
+    "exact bilinear": {"koopman.model": "exact", "koopman.feet": "measured"},
+    "bilinear EDMD": {
+        "koopman.model": "bilinear", "koopman.feet": "measured", "koopman.constant_rotation": True,
+    },
+}  # fmt: skip
+TUNE_SEEDS, REPORT_SEEDS = range(100, 104), range(16)
+SETS = 32  # weight sets, the config's own among them
+FALL = 10.0  # cost of a fall, in rmse of 1 m/s
+
+
+def main() -> None:
+    """Parse the command line and run what is missing."""
+    parser = cli.script_parser(__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="two models, few sets and seeds")
+    parser.add_argument("--residual", type=Path, metavar="DIR", help="results of whole_body.py: "
+                        "walk with its residual as well")  # fmt: skip
+    parser.add_argument("--gaits", nargs="+", choices=GAITS, default=list(GAITS))
+    args = parser.parse_args()
+    folder = cli.output_folder(args, "model_walks")
+    cli.configure_jax()
+    path, clock = folder / "walks.json", time.perf_counter()
+    there = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if there and there["code"] != code_version():
+        cli.fail(f"{path} holds walks of other code or versions: give --out another folder")
+    walks = there.get("walks", {})
+    for gait in args.gaits:
+        models = models_of(gait, args)
+        for name, keys in models.items():
+            label = f"{gait}, {name}" + (", quick" if args.quick else "")
+            if label in walks:
+                continue
+            walks[label] = {"gait": gait, "model": name, **walk(gait, keys, args.quick)}
+            cli.save_json(path, {"code": code_version(), "walks": walks})
+            tuned = walks[label]["tuned"]
+            print(f"{label}: rmse {tuned['rmse_median']:.4f} m/s, {tuned['falls']} of "
+                  f"{tuned['episodes']} fell, tuned on {walks[label]['sets']} sets "
+                  f"({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
+    text = table(walks)
+    (folder / "table.md").write_text(text, encoding="utf-8")
+    figure(walks, folder / "figure.png")
+    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), "walks": walks})
+    print(text)
+    print(f"results in {folder}/")
+
+
+def models_of(gait: str, args: Any) -> dict[str, dict[str, Any]]:
+    """Config keys of the models to walk with."""
+    models = dict(list(MODELS.items())[:1] + list(MODELS.items())[3:4]) if args.quick else MODELS
+    if args.residual is not None and gait == "trot":  # its step of 5 ms is no bound's
+        file = args.residual / f"residual_{gait}.npz"
+        if not file.exists():
+            cli.fail(f"--residual: no {file.name} in {args.residual}")
+        models = models | {
+            "planted SRB + residual": {
+                "koopman.model": "residual", "koopman.file": str(file.resolve()),
+                "koopman.feet": "measured", "koopman.dataset.dt": 0.005,
+            }
+        }  # fmt: skip
+    return models
+
+
+def walk(gait: str, keys: dict[str, Any], quick: bool) -> dict[str, Any]:
+    """Tune the weights of a model, then report them and the config's own on other seeds."""
+    sets, tune, report = SETS, list(TUNE_SEEDS), list(REPORT_SEEDS)
+    if quick:
+        sets, tune, report = 3, tune[:1], report[:2]
+    base = config_of(gait, keys)
+    scales = weight_scales(sets)
+    candidates = [scaled(base, gait, row) for row in scales]
+    rows = run([dataclasses.replace(c, seed=s) for c in candidates for s in tune])
+    costs = np.array([cost(row) for row in rows]).reshape(sets, len(tune)).mean(axis=1)
+    best = int(np.argmin(costs))
+    final = run([dataclasses.replace(c, seed=s) for c in (candidates[best], base) for s in report])
+    return {
+        "sets": sets,
+        "best_set": best,
+        "scales": dict(zip(NAMES, scales[best], strict=True)),
+        "tuning_cost": costs,
+        "tuned": statistics(final[: len(report)]),
+        "own_weights": statistics(final[len(report) :]),
+    }
+
+
+NAMES = ("p_x", "p_z", "theta", "v_x", "v_z", "omega", "input")
+
+
+def weight_scales(sets: int) -> np.ndarray:
+    """Factors of the weights (sets, 7); the first set is the config's own. The same for all."""
+    rng = np.random.default_rng(0)
+    scales = np.exp(rng.uniform(-np.log(5.0), np.log(5.0), (sets, len(NAMES))))
+    scales[0] = 1.0
+    return scales
+
+
+def scaled(config: RunConfig, gait: str, row: np.ndarray) -> RunConfig:
+    """The config with its weights times these factors."""
+    part = config.lmpc if gait == "trot" else config.bound
+    weights = tuple(float(w * f) for w, f in zip(part.state_weights, row[:6], strict=True))
+    part = dataclasses.replace(
+        part, state_weights=weights, input_weight=float(part.input_weight * row[6])
+    )
+    return dataclasses.replace(config, **{"lmpc" if gait == "trot" else "bound": part})
+
+
+def config_of(gait: str, keys: dict[str, Any]) -> RunConfig:
+    """Flat ground, three speeds in turn, feet-only contacts."""
+    speeds = SPEEDS[gait]
+    own = {
+        "duration": 2.0 + 2.0 * len(speeds),
+        "sim.contacts": "feet",
+        "lmpc.command_slew": 1.0,
+        "command.times": [0.0, *(2.0 * i for i in range(1, len(speeds)))],
+        "command.velocities": list(speeds),
+    }
+    return load_config(RunConfig, CONFIGS / GAITS[gait], {**own, **keys})
+
+
+def run(configs: list[RunConfig]) -> list[dict[str, Any]]:
+    """Metrics of the episodes."""
+    from kjax.sim.batch_loop import BatchEngine
+
+    recording = BatchEngine(configs[0], torques="held").run(configs)
+    if recording.interrupted:
+        raise KeyboardInterrupt
+    return list(recording.metrics())
+
+
+def cost(row: dict[str, Any]) -> float:
+    """Error of the velocity, and a hundredth of a metre per second for each degree of pitch."""
+    if row["fell"]:
+        return FALL
+    return float(row["velocity_rmse_mps"] + 0.01 * row["pitch_p95_deg"])
+
+
+def statistics(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Falls; medians of those that stayed up, with the interval of the median (95 %, bootstrap)."""
+    up = [row for row in rows if not row["fell"]]
+    out: dict[str, Any] = {"episodes": len(rows), "falls": len(rows) - len(up)}
+    rng = np.random.default_rng(0)
+    for name, key in (("rmse", "velocity_rmse_mps"), ("pitch", "pitch_p95_deg")):
+        values = np.array([row[key] for row in up]) if up else np.array([np.nan])
+        draws = np.median(rng.choice(values, (2000, len(values))), axis=1)
+        out[f"{name}_median"] = float(np.median(values))
+        out[f"{name}_low"], out[f"{name}_high"] = map(float, np.quantile(draws, [0.025, 0.975]))
+    return out
+
+
+def table(walks: dict[str, Any]) -> str:
+    """Markdown."""
+    lines = [
+        "| gait, model | rmse of v_x, tuned [m/s] | fell | pitch, 95 % [deg] | not tuned | fell |",
+        "|---|---|---|---|---|---|",
+    ]
+    for label, entry in walks.items():
+        tuned, own = entry["tuned"], entry["own_weights"]
+        lines.append(
+            f"| {label} | {_interval(tuned, 'rmse')} | {tuned['falls']} of {tuned['episodes']} | "
+            f"{_interval(tuned, 'pitch')} | {_interval(own, 'rmse')} | {own['falls']} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _interval(entry: dict[str, Any], name: str) -> str:
+    value, low, high = (entry[f"{name}_{part}"] for part in ("median", "low", "high"))
+    return "none stayed up" if np.isnan(value) else f"{value:.3g} ({low:.3g} to {high:.3g})"
+
+
+def figure(walks: dict[str, Any], path: Path) -> None:
+    """Error of the speed for each model, tuned and with the config's own weights."""
+    gaits = list(dict.fromkeys(entry["gait"] for entry in walks.values()))
+    fig, axes = plt.subplots(
+        1, len(gaits), figsize=(1.5 + 4.5 * len(gaits), 3.6), layout="constrained", squeeze=False
+    )
+    for ax, gait in zip(axes[0], gaits, strict=True):
+        own = [entry for entry in walks.values() if entry["gait"] == gait]
+        for shift, key, label in (
+            (-0.12, "own_weights", "config's weights"),
+            (0.12, "tuned", "tuned"),
+        ):
+            value, low, high = (
+                np.array([e[key][f"rmse_{part}"] for e in own])
+                for part in ("median", "low", "high")
+            )
+            at = np.arange(len(own)) + shift
+            ax.errorbar(value, at, xerr=[value - low, high - value], fmt="o", ms=4, label=label)
+            for y, entry in zip(at, own, strict=True):
+                if entry[key]["falls"]:
+                    count = f"{entry[key]['falls']} of {entry[key]['episodes']} fell"
+                    ax.annotate(count, (1.0, y), xycoords=("axes fraction", "data"),
+                                ha="right", va="center", fontsize=7)  # fmt: skip
+        ax.set_yticks(range(len(own)), [entry["model"] for entry in own])
+        ax.invert_yaxis()
+        ax.set(xlabel="rmse of v_x [m/s]", title=gait)
+        ax.set_xlim(left=0.0)
+        ax.grid(axis="x", alpha=0.3)
+    axes[0][0].legend(fontsize=8)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
+
+
+if __name__ == "__main__":
+    cli.run(main)
