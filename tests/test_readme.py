@@ -19,7 +19,7 @@ def blocks(repository, language):
 
 def test_the_controller_example_walks_somebody_elses_robot(repository):
     """The reader's loop: raw MuJoCo here, none of kjax's simulation code but the scene."""
-    code, _ = blocks(repository, "python")
+    code, _, _ = blocks(repository, "python")
     model = build_model(RunConfig().sim)
     at = resolve(model)
     data = mujoco.MjData(model)
@@ -55,7 +55,7 @@ def test_the_controller_example_walks_somebody_elses_robot(repository):
 
 
 def test_the_qp_example_runs_in_the_precision_that_a_reader_has(repository):
-    _, code = blocks(repository, "python")
+    _, code, _ = blocks(repository, "python")
     scope = {}
     with jax.enable_x64(False):
         exec(code, scope)
@@ -64,6 +64,16 @@ def test_the_qp_example_runs_in_the_precision_that_a_reader_has(repository):
     np.testing.assert_allclose(scope["slope"], [-0.25, 0.0], rtol=1e-5)
     # Without the factor 1.01 the first is -0.5, and the row x_1 + x_2 <= 0.5 holds just so.
     np.testing.assert_allclose(scope["rows"].x, [-0.5, 1.0], rtol=1e-5)
+
+
+def test_the_models_example_runs(repository):
+    _, _, code = blocks(repository, "python")
+    scope = {}
+    exec(code, scope)
+    assert scope["predicted"].shape == (41, 6)
+    assert scope["A"].shape == (9, 9)
+    assert scope["B"].shape == (9, 4)
+    assert np.isfinite(scope["predicted"]).all()
 
 
 def test_the_commands_name_files_and_keys_that_exist(repository):
