@@ -126,4 +126,4 @@ def block_rows(
     def one(triangle: Triangle, block: tuple[Array, Array]) -> tuple[Triangle, None]:
         return accumulate(triangle, *block), None
 
-    return jax.lax.scan(one, triangle, (Z, Y))[0]
+    return jax.lax.scan(one, triangle, (jnp.asarray(Z), jnp.asarray(Y)))[0]
