@@ -85,8 +85,12 @@ def main() -> None:
     curves: dict[str, Any] = {}
     for gait, kinds in GAITS.items():
         used = kinds[:1] if args.quick else kinds
-        recordings = {kind: record(kind, args, folder) for kind in used}
-        metrics[gait], curves[gait], fits = study(gait, recordings)
+        try:
+            recordings = {kind: record(kind, args, folder) for kind in used}
+            metrics[gait], curves[gait], fits = study(gait, recordings)
+        except KeyboardInterrupt:
+            print(f"stopped; finished recordings are kept in {folder}/, run again to go on")
+            raise SystemExit(130) from None
         affine = fits["affine"]
         storage.save(
             folder / f"residual_{gait}.npz",

@@ -42,7 +42,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def run(main: Callable[[], None]) -> None:
-    """Call an experiment's ``main``; Ctrl-C and a full disk end it without a traceback."""
+    """Call an experiment's ``main``; Ctrl-C, a full disk, a bad config end without a traceback."""
     try:
         main()
     except KeyboardInterrupt:
@@ -50,6 +50,8 @@ def run(main: Callable[[], None]) -> None:
         raise SystemExit(130) from None
     except OSError as error:
         fail(f"{error.filename or 'output'}: {error.strerror or error}")
+    except ConfigError as error:  # what only shows when a config is put to use
+        fail(str(error))
 
 
 def script_parser(description: str) -> argparse.ArgumentParser:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax import srb
-from kjax.config import KoopmanConfig
+from kjax.config import ConfigError, KoopmanConfig
 from kjax.koopman import families, storage
 from kjax.koopman.dataset import ranges_from_config, sample
 from kjax.koopman.edmd import build_dictionary, fit_bilinear
@@ -38,7 +38,7 @@ def build_family(config: KoopmanConfig) -> Family:
     """The family of a config's model.
 
     Raises:
-      ValueError: for a file that cannot be used.
+      ConfigError: for a file that cannot be used.
     """
     dt = config.dataset.dt
     if config.model == "linear":
@@ -71,7 +71,8 @@ def build_prediction(
       height: of the centre of mass, for what is linearised beforehand [m].
 
     Raises:
-      ValueError: for a file that cannot be used, and for a fit that is not finite.
+      ConfigError: for a file that cannot be used.
+      ValueError: for a fit that is not finite.
     """
     alpha = jnp.asarray(MODE_ALPHA, float)
     force = jax.vmap(families.hover)(body, alpha)
@@ -123,7 +124,7 @@ def _stored(config: KoopmanConfig) -> storage.Stored:
         changed = 0
     stored = _read(path, config.model, changed)
     if abs(stored.dt - config.dataset.dt) > 1e-9:
-        raise ValueError(
+        raise ConfigError(
             f"koopman.file: '{path}' holds a model of steps of {stored.dt} s, koopman.dataset.dt "
             f"is {config.dataset.dt} s"
         )

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kjax.config import ConfigError
 from kjax.koopman.families import BilinearModel
 from kjax.koopman.learned import Layer, LearnedModel
 from kjax.types import Mode
@@ -51,16 +52,16 @@ def load(path: Path, family: str) -> Stored:
     """Read a model of this family.
 
     Raises:
-      ValueError: for a file that is not there, not a model's, of another family, or not finite.
+      ConfigError: for a file that is not there, not a model's, of another family, or not finite.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
     except (OSError, ValueError) as error:
-        raise ValueError(f"koopman.file: cannot read '{path}': {error}") from None
+        raise ConfigError(f"koopman.file: cannot read '{path}': {error}") from None
     if "family" not in arrays or str(arrays["family"]) != family:
         there = str(arrays.get("family", "no model"))
-        raise ValueError(f"koopman.file: '{path}' holds {there}, wanted a {family} model")
+        raise ConfigError(f"koopman.file: '{path}' holds {there}, wanted a {family} model")
     try:
         if family == "residual":
             numbers: Any = arrays["W"]
@@ -74,12 +75,12 @@ def load(path: Path, family: str) -> Stored:
             )
         stored = Stored(family, float(arrays["dt"]), numbers, arrays["spread"])
     except KeyError as error:
-        raise ValueError(f"koopman.file: '{path}' lacks {error}") from None
+        raise ConfigError(f"koopman.file: '{path}' lacks {error}") from None
     for name, values in arrays.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise ValueError(f"koopman.file: '{path}': {name} holds numbers that are not finite")
+            raise ConfigError(f"koopman.file: '{path}': {name} holds numbers that are not finite")
     if len(stored.spread) != len(Mode):
-        raise ValueError(
+        raise ConfigError(
             f"koopman.file: '{path}' holds {len(stored.spread)} contact modes, wanted {len(Mode)}"
         )
     return stored
