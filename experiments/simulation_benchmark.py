@@ -31,7 +31,7 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 BATCHES = (16, 128, 1024)
 MJX_BATCHES = (16, 128, 1024)
 ENGINE_CASES = 64  # walked by both engines
-ROUNDS = 3  # of closed loop and bare engine in turn; medians of each, and of their ratios
+ROUNDS = 5  # of closed loop and bare engine in turn; medians of each, and of their ratios
 WALK = 0.5  # s of walking that is timed in C
 WALK_MJX = 0.25
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from kjax import gait, qp
 from kjax.config import RunConfig
 from kjax.legs import lateral, swing
-from kjax.legs.base import LegCommand, build_base
+from kjax.legs.base import LegCommand, View, build_base
 from kjax.mpc.lmpc import LmpcMemory, start_memory
 from kjax.params import ControllerParams
 from kjax.planning import ForceTask, Planner, build_planner, periodic_motion
@@ -87,6 +87,9 @@ class Controller(NamedTuple):
       act: (params, state, observation) -> (state, torque), once per sim_dt; torque (4, 3) [N m]
         of (abduction, thigh, calf) in leg order, within the robot's limits.
       step: plan, then act: (params, state, observation) -> (state, torque, info).
+      init_from: (params, view) -> state; ``init`` for a caller that knows the view itself, such as
+        a rigid body without legs (``kjax.tuning``).
+      plan_from: (params, state, view, contact, readable) -> (state, info); ``plan`` likewise.
     """
 
     init: Callable[[ControllerParams, Observation], ControllerState]
@@ -100,6 +103,11 @@ class Controller(NamedTuple):
     step: Callable[
         [ControllerParams, ControllerState, Observation],
         tuple[ControllerState, Float[Array, "4 3"], PlanInfo],
+    ]
+    init_from: Callable[[ControllerParams, View], ControllerState]
+    plan_from: Callable[
+        [ControllerParams, ControllerState, View, Bool[Array, "4"], Bool[Array, ""]],
+        tuple[ControllerState, PlanInfo],
     ]
 
 
@@ -119,7 +127,11 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
         observation = _cast(observation, params)
         track = base.track(observation)
-        view = base.view(params.robot, track, observation)
+        return init_from(params, base.view(params.robot, track, observation), track)
+
+    def init_from(
+        params: ControllerParams, view: View, track: Array | None = None
+    ) -> ControllerState:
         zero = jnp.zeros_like(params.position_slack)
         return ControllerState(
             time=zero,
@@ -142,11 +154,19 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
         observation = _cast(observation, params)
         readable = _all_finite(observation, state.track)
         view = base.view(params.robot, state.track, _stand_in(observation, readable, params))
+        return plan_from(params, state, view, observation.contact, readable)
+
+    def plan_from(
+        params: ControllerParams,
+        state: ControllerState,
+        view: View,
+        contact: Array,
+        readable: Array,
+    ) -> tuple[ControllerState, PlanInfo]:
         body = view.planar
         schedule = params.schedule
 
-        wanted = params.gaits[_piece(params.gait_times, state.time)]
-        clock = gait.advance(schedule, state.clock, lmpc.control_dt, wanted)
+        clock = next_clock(params, state, lmpc.control_dt)
         where = (clock.gait, clock.phase)
         stance, mode = schedule.stance[where], schedule.mode[where]
         lifting = state.stance & ~stance
@@ -157,7 +177,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
             state.swing, lifting | anew, view.feet, gait.time_to_touchdown(schedule, clock)
         )
         cut = stance & ~state.stance & switched
-        swings = swing.end_swings(params.swing, swings, stance, cut, observation.contact, view.feet)
+        swings = swing.end_swings(params.swing, swings, stance, cut, contact, view.feet)
 
         command = params.command.velocities[_piece(params.command.times, state.time)]
         change = params.command_slew * lmpc.control_dt
@@ -257,7 +277,15 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
         state, torque = act(params, state, observation)
         return state, torque, info
 
-    return Controller(init=init, plan=plan, act=act, step=step)
+    return Controller(
+        init=init, plan=plan, act=act, step=step, init_from=init_from, plan_from=plan_from
+    )
+
+
+def next_clock(params: ControllerParams, state: ControllerState, control_dt: float) -> gait.Clock:
+    """Place in the gait at the next plan, ``control_dt`` [s] after the last one."""
+    wanted = params.gaits[_piece(params.gait_times, state.time)]
+    return gait.advance(params.schedule, state.clock, control_dt, wanted)
 
 
 def _cast(observation: Observation, params: ControllerParams) -> Observation:

@@ -1,5 +1,6 @@
 """All numbers of a controller, and how they come from a config: fit, condense, gather."""
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -8,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from kjax import gait
-from kjax.config import RunConfig
+from kjax.config import KoopmanConfig, RunConfig, SrbConfig
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import fit_modes, srb_params
+from kjax.koopman.models import LinearModel
 from kjax.koopman.prediction import Prediction, build_prediction
 from kjax.legs import lateral, swing
 from kjax.mpc import multiphase
@@ -74,76 +76,122 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
       dtype: floating type of the result; JAX's current default if ``None``.
     """
     dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    with jax.enable_x64(True):
+        params = jax.device_get(gather(config, robot, fit_models(config, robot)))
+    return cast(params, dtype)
+
+
+def cast(params: ControllerParams, dtype: Any) -> ControllerParams:
+    """Parameters on the device, floats in ``dtype``, integers as int32."""
+    return jax.tree.map(lambda leaf: _as(leaf, dtype), params)
+
+
+class Fits(NamedTuple):
+    """What is learned from data, of every contact mode.
+
+    Attributes:
+      model: linear EDMD models over one step of the data.
+      feet: (M, 2, 2) nominal contact points, body frame [m].
+      spread: (M, 6) standard deviation of the one-step error of the model in use.
+      prediction: another prediction model, where the config names one.
+    """
+
+    model: LinearModel
+    feet: Float[Array, "M 2 2"]
+    spread: Float[Array, "M 6"]
+    prediction: Prediction | None
+
+
+def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
+    """Fit the Koopman models of a config; call it in float64.
+
+    Configs that differ elsewhere, in weights or bounds, share one fit.
+    """
+    bound = config.bound
+    sole = float(robot.foot_radius - bound.height)
+    feet = ((bound.feet_front, sole), (-bound.feet_rear, sole))
+    height = config.lmpc.height if config.koopman.model == "srb_hover" else 0.0
+    # What a file holds may have changed since.
+    fit = _fit.__wrapped__ if config.koopman.file else _fit
+    return fit(config.srb, config.koopman, feet, height)
+
+
+@lru_cache(maxsize=32)
+def _fit(
+    srb: SrbConfig,
+    koopman: KoopmanConfig,
+    bound_feet: tuple[tuple[float, float], tuple[float, float]],
+    height: float,
+) -> Fits:
+    body = srb_params(srb, {Mode.FRONT: bound_feet, Mode.REAR: bound_feet})
+    key = jax.random.key(koopman.dataset.seed)
+    model, report = _fit_modes(body, koopman, key)
+    if not bool(report.finite.all()):
+        raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
+    prediction = None
+    if koopman.model != "linear":
+        prediction = build_prediction(body, koopman, key, height=height)
+    spread = report.residual_rms if prediction is None else prediction.spread
+    return jax.device_get(Fits(model, body.feet, spread, prediction))
+
+
+def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParams:
+    """Parameters from a config and its fits; the config's continuous numbers may be traced."""
     gaits = build_gaits(config)
     names = [g.name for g in gaits]
     leg, bound, sideways = config.leg, config.bound, config.lateral
     is_bound = np.array([name == "bound" for name in names])
-    sole = robot.foot_radius - bound.height
-    bound_feet = ((bound.feet_front, float(sole)), (-bound.feet_rear, float(sole)))
-    with jax.enable_x64(True):
-        body = srb_params(config.srb, {Mode.FRONT: bound_feet, Mode.REAR: bound_feet})
-        key = jax.random.key(config.koopman.dataset.seed)
-        model, report = _fit_modes(body, config.koopman, key)
-        if not bool(report.finite.all()):
-            raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
-        prediction = None
-        if config.koopman.model != "linear":
-            prediction = build_prediction(body, config.koopman, key, height=config.lmpc.height)
-        params = ControllerParams(
-            robot=robot,
-            tables=_build_tables(
-                model,
-                mode_settings(config.lmpc, bound, config.srb.mass),
-                steps=round(config.lmpc.model_dt / config.koopman.dataset.dt),
-                horizon=config.lmpc.horizon,
-                feet=body.feet,
-                spread=report.residual_rms if prediction is None else prediction.spread,
-                caution=config.lmpc.caution,
-            ),
-            prediction=prediction,
-            feet=body.feet,
-            schedule=gait.build_schedule(gaits),
-            gait_times=jnp.asarray(config.gait.times),
-            gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
-            reference=jnp.asarray(_reference_tables(gaits, config)),
-            multiphase=multiphase_params(gaits, config, robot),
-            swing=swing.SwingParams(
-                apex=jnp.asarray(np.where(is_bound, bound.apex, leg.apex)),
-                velocity_gain=jnp.asarray(
-                    np.where(is_bound, bound.velocity_gain, leg.velocity_gain)
-                ),
-                offset=jnp.asarray(is_bound[:, None] * _bound_offset(robot, config)),
-                horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
-                hold_after=jnp.asarray(leg.hold_after),
-                reach_speed=jnp.asarray(leg.reach_speed),
-                kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
-                kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
-            ),
-            lateral=lateral.LateralParams(
-                roll=jnp.asarray([sideways.roll_stiffness, sideways.roll_damping]),
-                yaw=jnp.asarray([sideways.yaw_stiffness, sideways.yaw_damping]),
-                damping=jnp.asarray(sideways.damping),
-                weights=jnp.asarray(sideways.wrench_weights),
-                ridge=jnp.asarray(sideways.force_weight),
-                friction=jnp.asarray(sideways.friction),
-                friction_offset=jnp.asarray(sideways.friction_offset),
-                friction_x=jnp.asarray(
-                    np.where(is_bound, sideways.plan_friction_bound, sideways.plan_friction)
-                ),
-                foothold_gain=jnp.asarray(sideways.velocity_gain),
-            ),
-            command=Command(
-                times=jnp.asarray(config.command.times),
-                velocities=jnp.asarray(config.command.velocities),
-            ),
-            height=jnp.asarray(np.where(is_bound, bound.height, config.lmpc.height)),
-            follow_ground=jnp.asarray(float(config.lmpc.height_above == "feet")),
-            command_slew=jnp.asarray(config.lmpc.command_slew, float),
-            integral=jnp.asarray([config.lmpc.integral_gains, config.lmpc.integral_limits]),
-            position_slack=jnp.asarray(config.lmpc.position_slack),
-        )
-        params = jax.device_get(params)
-    return jax.tree.map(lambda leaf: _as(leaf, dtype), params)
+    return ControllerParams(
+        robot=robot,
+        tables=_build_tables(
+            fits.model,
+            mode_settings(config.lmpc, bound, config.srb.mass),
+            steps=round(config.lmpc.model_dt / config.koopman.dataset.dt),
+            horizon=config.lmpc.horizon,
+            feet=fits.feet,
+            spread=fits.spread,
+            caution=config.lmpc.caution,
+        ),
+        prediction=fits.prediction,
+        feet=fits.feet,
+        schedule=gait.build_schedule(gaits),
+        gait_times=jnp.asarray(config.gait.times),
+        gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
+        reference=_reference_tables(gaits, config),
+        multiphase=multiphase_params(gaits, config, robot),
+        swing=swing.SwingParams(
+            apex=jnp.where(is_bound, bound.apex, leg.apex),
+            velocity_gain=jnp.where(is_bound, bound.velocity_gain, leg.velocity_gain),
+            offset=jnp.asarray(is_bound)[:, None] * _bound_offset(robot, config),
+            horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
+            hold_after=jnp.asarray(leg.hold_after),
+            reach_speed=jnp.asarray(leg.reach_speed),
+            kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
+            kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
+        ),
+        lateral=lateral.LateralParams(
+            roll=jnp.asarray([sideways.roll_stiffness, sideways.roll_damping]),
+            yaw=jnp.asarray([sideways.yaw_stiffness, sideways.yaw_damping]),
+            damping=jnp.asarray(sideways.damping),
+            weights=jnp.asarray(sideways.wrench_weights),
+            ridge=jnp.asarray(sideways.force_weight),
+            friction=jnp.asarray(sideways.friction),
+            friction_offset=jnp.asarray(sideways.friction_offset),
+            friction_x=jnp.where(is_bound, sideways.plan_friction_bound, sideways.plan_friction),
+            foothold_gain=jnp.asarray(sideways.velocity_gain),
+        ),
+        command=Command(
+            times=jnp.asarray(config.command.times),
+            velocities=jnp.asarray(config.command.velocities),
+        ),
+        height=jnp.where(is_bound, bound.height, config.lmpc.height),
+        follow_ground=jnp.asarray(float(config.lmpc.height_above == "feet")),
+        command_slew=jnp.asarray(config.lmpc.command_slew, float),
+        integral=jnp.stack(
+            [jnp.asarray(config.lmpc.integral_gains), jnp.asarray(config.lmpc.integral_limits)]
+        ),
+        position_slack=jnp.asarray(config.lmpc.position_slack),
+    )
 
 
 _fit_modes = jax.jit(fit_modes, static_argnames="config")
@@ -205,31 +253,35 @@ def multiphase_params(
     )
 
 
-def _reference_tables(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
+def _reference_tables(gaits: list[gait.Gait], config: RunConfig) -> Array:
     """Periodic motion of every gait at every ramp level; zero but for a bound that wants one."""
     bound = config.bound
     levels = 1 + max(g.ramp_cycles for g in gaits)
-    rows = np.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
+    rows = jnp.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
     for index, one in enumerate(gaits):
         if one.name != "bound" or bound.reference != "periodic":
             continue
         modes = [phase.mode for phase in one.phases]
-        for level in range(levels):
-            rows[index, level] = periodic_reference(
+        cycles = [
+            periodic_reference(
                 np.array(one.durations(level)),
                 modes,
                 bound.feet_front,
                 bound.feet_rear,
                 config.srb.mass,
                 config.srb.inertia,
+                bound.force_edge,
             ).rows
+            for level in range(levels)
+        ]
+        rows = rows.at[index].set(jnp.stack(cycles))
     return rows
 
 
-def _bound_offset(robot: RobotParams, config: RunConfig) -> np.ndarray:
+def _bound_offset(robot: RobotParams, config: RunConfig) -> Array:
     """Foothold of a bound ahead of the hip, standing still, for each leg [m]."""
     wanted = [config.bound.feet_front] * 2 + [-config.bound.feet_rear] * 2
-    return np.asarray(wanted) - np.asarray(robot.hip_pos)[:, 0]
+    return jnp.stack([jnp.asarray(one, float) for one in wanted]) - robot.hip_pos[:, 0]
 
 
 def _as(leaf: Any, dtype: Any) -> Array:

@@ -60,10 +60,10 @@ def dynamics(
 
 def planted_dynamics(
     params: SrbParams,
-    alpha: Float[Array, "2"],
-    ground: Float[Array, "2 2"],
+    alpha: Float[Array, "n"],
+    ground: Float[Array, "n 2"],
     x: Float[Array, "6"],
-    u: Float[Array, "4"],
+    u: Float[Array, "forces"],
     *,
     world_forces: bool = False,
 ) -> Float[Array, "6"]:
@@ -73,13 +73,13 @@ def planted_dynamics(
 
     Args:
       params: mass and inertia; its contact points are of no effect.
-      alpha: (2,) number of stance legs at the front and at the rear.
-      ground: (2, 2) contact points P (front, rear) x (x, z), world frame [m].
+      alpha: (n,) number of stance legs at each contact point; n = 2 for front and rear, 4 for legs.
+      ground: (n, 2) contact points P, (x, z), world frame [m].
       x: (6,) state.
-      u: (4,) force of one front and one rear leg [N].
+      u: (2n,) force of one leg at each contact point [N].
       world_forces: whether ``u`` is in the world frame rather than in the body's.
     """
-    force = alpha[:, None] * u.reshape(2, 2)
+    force = alpha[:, None] * u.reshape(ground.shape)
     if not world_forces:
         force = force @ planar_rotation(x[2]).T
     arm = ground - x[:2]

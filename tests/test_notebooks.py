@@ -11,6 +11,7 @@ NOTEBOOKS = (
     "2_what_lifting_buys",
     "3_residual_models",
     "4_your_own_simulator",
+    "5_tuning_through_the_loop",
 )
 
 pytestmark = pytest.mark.slow

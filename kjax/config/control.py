@@ -140,6 +140,8 @@ class BoundConfig:
     which then has the weights and bounds) [-]."""
     reference: Literal["periodic", "constant"] = "periodic"
     """Reference of height and pitch: the cycle's own motion, or constant (the paper) [-]."""
+    force_edge: Annotated[float, Field(gt=0, le=0.5)] = 0.25
+    """Part of a stance in which the periodic reference's force rises, and again falls [-]."""
     height: Positive = 0.27
     """Mean height of the centre of mass in stance [m]."""
     state_weights: tuple[

@@ -7,16 +7,17 @@ vertical forces whose impulses carry the weight over a cycle and leave no net tu
     J_f + J_r = m g T,   J_f l_f = J_r l_r
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 # Reference rows: deviation of height, pitch, v_z and omega.
 REFERENCE_NAMES = ("p_z", "theta", "v_z", "omega")
 SAMPLES = 51  # per phase, ends included; at most 2 ms apart in the gaits at hand
-_EDGE = 0.25  # part of a stance in which the force rises, and again in which it falls
 
 
 class PeriodicReference(NamedTuple):
@@ -27,19 +28,22 @@ class PeriodicReference(NamedTuple):
       impulses: (2,) impulse of the front and of the rear pair per cycle [N s].
     """
 
-    rows: np.ndarray
-    impulses: np.ndarray
+    rows: Float[Array, "phases samples 4"]
+    impulses: Float[Array, "2"]
 
 
 def periodic_reference(
     durations: np.ndarray,
     modes: list[Mode],
-    lever_front: float,
-    lever_rear: float,
-    mass: float,
-    inertia: float,
+    lever_front: Any,
+    lever_rear: Any,
+    mass: Any,
+    inertia: Any,
+    edge: Any = 0.25,
 ) -> PeriodicReference:
     """Periodic reference of a cycle of front, rear and flight phases.
+
+    Differentiable by all but the durations and modes.
 
     Args:
       durations: (phases,) length of each phase [s].
@@ -48,6 +52,7 @@ def periodic_reference(
       lever_rear: the same of the rear feet [m].
       mass: of the body [kg].
       inertia: about the pitch axis [kg m^2].
+      edge: part of a stance in which the force rises, and again in which it falls, up to 1/2 [-].
 
     Raises:
       ValueError: where front and rear do not both stand exactly once per cycle.
@@ -57,21 +62,22 @@ def periodic_reference(
     if len(front) != 1 or len(rear) != 1 or front == rear:
         raise ValueError(f"a bound has one front and one rear stance per cycle, got {modes}")
     total = mass * GRAVITY * float(np.sum(durations))
-    impulses = total * np.array([lever_rear, lever_front]) / (lever_front + lever_rear)
+    impulses = jnp.stack([lever_rear * total, lever_front * total]) / (lever_front + lever_rear)
 
     # Integrate on a fine grid of equal cells per phase, forces at the cells' middles.
     cells = 20 * (SAMPLES - 1)
     middle = (np.arange(cells) + 0.5) / cells
-    shape = np.clip(np.minimum(middle, 1.0 - middle) / _EDGE, 0.0, 1.0)
+    shape = jnp.clip(np.minimum(middle, 1.0 - middle) / edge, 0.0, 1.0)
     shape /= shape.mean()
-    force = np.zeros((len(modes), cells))
-    moment = np.zeros_like(force)
+    force = jnp.zeros((len(modes), cells))
+    moment = jnp.zeros_like(force)
     for i, impulse, lever in (
         (front[0], impulses[0], lever_front),
         (rear[0], impulses[1], -lever_rear),
     ):
-        force[i] = shape * impulse / durations[i]
-        moment[i] = lever * force[i]  # a force ahead of the body turns the nose up
+        pushed = shape * impulse / durations[i]
+        force = force.at[i].set(pushed)
+        moment = moment.at[i].set(lever * pushed)  # ahead of the body it turns the nose up
     step = np.repeat(np.asarray(durations) / cells, cells)
     z, v_z = _periodic(force.reshape(-1) / mass - GRAVITY, step)
     theta, omega = _periodic(moment.reshape(-1) / inertia, step)
@@ -79,20 +85,20 @@ def periodic_reference(
     # The mean over the two stances is zero: that is where the height reference refers to, and
     # the trunk is level on average while it can be acted on.
     at = np.arange(len(modes))[:, None] * cells + np.arange(SAMPLES) * (cells // (SAMPLES - 1))
-    standing = np.isin(np.arange(len(modes)), [front[0], rear[0]])
-    z = z - np.mean([z[at[i]].mean() for i in np.flatnonzero(standing)])
-    theta = theta - np.mean([theta[at[i]].mean() for i in np.flatnonzero(standing)])
-    rows = np.stack([z[at], theta[at], v_z[at], omega[at]], axis=-1)
+    stances = at[[front[0], rear[0]]]
+    z, theta = (a - a[stances].mean() for a in (z, theta))
+    rows = jnp.stack([z[at], theta[at], v_z[at], omega[at]], axis=-1)
     return PeriodicReference(rows=rows, impulses=impulses)
 
 
-def _periodic(acceleration: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _periodic(acceleration: Array, step: np.ndarray) -> tuple[Array, Array]:
     """Position and velocity at the cell borders under a piecewise constant acceleration.
 
     The mean velocity over the cycle is zero, so that the position returns to its start.
     """
-    gain = np.r_[0.0, np.cumsum(acceleration * step)]
+    zero = jnp.zeros((1,), acceleration.dtype)
+    gain = jnp.concatenate([zero, jnp.cumsum(acceleration * step)])
     travel = gain[:-1] * step + 0.5 * acceleration * step**2
     velocity = gain - travel.sum() / step.sum()
-    position = np.r_[0.0, np.cumsum(velocity[:-1] * step + 0.5 * acceleration * step**2)]
-    return position, velocity
+    moved = jnp.cumsum(velocity[:-1] * step + 0.5 * acceleration * step**2)
+    return jnp.concatenate([zero, moved]), velocity

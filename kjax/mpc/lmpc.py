@@ -72,32 +72,36 @@ class ModeSettings(NamedTuple):
       input_reference: (M, 4) forces that R penalises the distance from [N].
     """
 
-    state_weights: np.ndarray
-    input_weights: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    input_reference: np.ndarray
+    state_weights: Float[Array, "M 6"]
+    input_weights: Float[Array, "M 4"]
+    lower: Float[Array, "M 4"]
+    upper: Float[Array, "M 4"]
+    input_reference: Float[Array, "M 4"]
 
 
-def mode_settings(lmpc: LmpcConfig, bound: BoundConfig, mass: float) -> ModeSettings:
-    """Settings per mode: the bound's own in front and rear stance, the LMPC's elsewhere."""
+def mode_settings(
+    lmpc: LmpcConfig, bound: BoundConfig, mass: float | Float[Array, ""]
+) -> ModeSettings:
+    """Settings per mode: the bound's own in front and rear stance, the LMPC's elsewhere.
+
+    The configs' numbers may be traced.
+    """
     single = np.isin(np.arange(len(Mode)), [Mode.FRONT, Mode.REAR])[:, None]
     standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
 
-    def chosen(of: Callable[[LmpcConfig | BoundConfig], Sequence[float]]) -> np.ndarray:
-        return np.where(single, np.asarray(of(bound)), np.asarray(of(lmpc)))
+    def chosen(of: Callable[[LmpcConfig | BoundConfig], Sequence[float]]) -> Array:
+        return jnp.where(single, jnp.asarray(of(bound), float), jnp.asarray(of(lmpc), float))
 
-    hover = np.outer(mass * GRAVITY / np.maximum(MODE_ALPHA.sum(axis=1), 1), [0.0, 1.0, 0.0, 1.0])
-    if lmpc.input_reference == "zero":
-        hover = np.zeros_like(hover)
+    share = np.outer(1.0 / np.maximum(MODE_ALPHA.sum(axis=1), 1), [0.0, 1.0, 0.0, 1.0])
+    hover = share * (0.0 if lmpc.input_reference == "zero" else mass * GRAVITY)
     lower = chosen(lambda config: [-config.force_x_max, config.force_z_min] * 2)
     upper = chosen(lambda config: [config.force_x_max, config.force_z_max] * 2)
     return ModeSettings(
         state_weights=chosen(lambda config: config.state_weights),
         input_weights=chosen(lambda config: [config.input_weight] * 4),
-        lower=np.where(standing, lower, 0.0),
-        upper=np.where(standing, upper, 0.0),
-        input_reference=np.where(standing, hover, 0.0),
+        lower=jnp.where(standing, lower, 0.0),
+        upper=jnp.where(standing, upper, 0.0),
+        input_reference=jnp.where(standing, hover, 0.0),
     )
 
 
@@ -123,7 +127,7 @@ def build_tables(
       caution: see ``condense.cautious_weights``.
     """
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
-    Q, R, lower, upper, u_ref = (jnp.asarray(value) for value in settings)
+    Q, R, lower, upper, u_ref = settings
 
     swinging = jnp.tile(lower == upper, (1, horizon))
     # White from step to step.

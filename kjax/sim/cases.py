@@ -41,7 +41,8 @@ _LMPC = (
 )  # fmt: skip
 _BOUND = (
     "front_stance", "first_flight", "rear_stance", "second_flight", "ramp_start", "feet_front",
-    "feet_rear", "reference", "height", "state_weights", "input_weight", "force_x_max",
+    "feet_rear", "reference", "force_edge", "height", "state_weights", "input_weight",
+    "force_x_max",
     "force_z_min", "force_z_max", "velocity_gain", "apex",
 )  # fmt: skip
 _MULTIPHASE = (

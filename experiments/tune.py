@@ -1,0 +1,348 @@
+"""Tune the controller by gradients through its closed loop, then see what MuJoCo says.
+
+Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body on legs
+without mass, the controller's own plan, 200 QPs a second), with others held out. With --baseline
+CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time. Both results, the
+start and the config's own numbers then walk the config's whole command in MuJoCo on other seeds.
+Leaves tuned.toml, metrics.json, table.md and figure.png in the output folder. The state is kept
+there as well: the same command goes on after Ctrl-C or a kill.
+"""
+
+import dataclasses
+import json
+import pickle
+import time
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from tqdm import tqdm
+
+from kjax import cli
+from kjax.config import CommandConfig, RunConfig
+from kjax.episodes import code_version, config_hash
+from kjax.sim.batch_loop import BatchEngine
+from kjax.sim.closed_cost import recording_costs
+from kjax.sim.summary import summarise
+from kjax.tuning import loop
+from kjax.tuning.optimise import build_objective, descend
+from kjax.tuning.space import KINDS, Space, Variables, build_space, tuned_config
+
+KEYS = {
+    "trot": ("lmpc.state_weights", "lmpc.input_weight"),
+    "bound": ("bound.state_weights", "bound.input_weight", "bound.velocity_gain"),
+}
+TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
+POPULATION_SEEDS = 4  # MuJoCo episodes per candidate of the baseline
+SIGMA = 0.5  # of the baseline's first population, about a factor of 1.6
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    config, args = _parse()
+    cli.configure_jax()
+    folder = cli.output_folder(args, "tune")
+    short, space = shortened(config, args), None
+    try:
+        space = build_space(short, args.keys)
+    except ValueError as error:
+        cli.fail(f"--keys: {error}")
+    begin = worsened(space, args.worsen, args.worsen_seed)
+    identity = config_hash(short) + json.dumps([code_version(), *_settings(args)])
+    train, held_out = (
+        loop.draw_scenarios(short, seed, count, speeds=args.speeds, pieces=args.pieces)
+        for seed, count in ((TRAIN_SEED, args.scenarios), (HELD_OUT_SEED, args.held_out))
+    )
+    objective = build_objective(short, space, memory=args.memory)
+    look = jax.jit(lambda z: jax.vmap(objective, (None, 0))(z, held_out).mean())
+    own_cost, begin_cost = float(look(space.start)), float(look(begin))
+    print(f"cost on {args.held_out} held-out scenarios: the config's own numbers {own_cost:.3f}, "
+          f"the start {begin_cost:.3f}", flush=True)  # fmt: skip
+    with tqdm(total=args.updates, unit="update", disable=None) as bar:
+
+        def show(number: int, value: float, best: float) -> None:
+            bar.n = number
+            bar.set_postfix_str(f"cost {value:.3f}, held out {best:.3f}")
+
+        try:
+            result = descend(
+                objective, space, train, held_out, start=begin, updates=args.updates,
+                rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
+                checkpoint=folder / "checkpoint.npz", identity=identity, on_update=show,
+            )  # fmt: skip
+        except ValueError as error:
+            cli.fail(str(error))
+    print(f"descent: {len(result.cost)} updates in {result.seconds:.0f} s, held-out cost "
+          f"{result.best_cost:.3f} after update {result.best_update} (ended by: {result.stopped})",
+          flush=True)  # fmt: skip
+    sets = {"own": space.start, "start": begin, "gradient": result.best}
+    baseline = None
+    if args.baseline:
+        baseline = evolve(short, space, begin, args, result.seconds, folder, identity)
+        sets["CMA-ES"] = baseline["best"]
+        print(f"CMA-ES in MuJoCo: {baseline['generations']} generations of "
+              f"{baseline['population']} in {baseline['seconds']:.0f} s", flush=True)  # fmt: skip
+    costs = {name: float(look(z)) for name, z in sets.items()}
+    verdict = {name: walk(config, space.overrides(z), args.seeds) for name, z in sets.items()}
+    cli.save_config(folder / "tuned.toml", tuned_config(config, space.overrides(result.best)))
+    record = {
+        "provenance": cli.provenance(),
+        "keys": list(args.keys),
+        "worsen": args.worsen,
+        "scenarios": {"train": args.scenarios, "held_out": args.held_out, "seconds": args.seconds},
+        "held_out_cost": costs,
+        "cost_over_own": {name: value / costs["own"] for name, value in costs.items()},
+        "values": {name: space.overrides(z) for name, z in sets.items()},
+        "descent": {
+            "updates": len(result.cost), "seconds": result.seconds, "stopped": result.stopped,
+            "best_update": result.best_update, "cost": result.cost,
+            "checks": result.checks, "held_out": result.held_out,
+        },
+        "baseline": baseline and {k: v for k, v in baseline.items() if k != "best"},
+        "mujoco": verdict,
+    }  # fmt: skip
+    cli.save_json(folder / "metrics.json", record)
+    text = table(record)
+    (folder / "table.md").write_text(text, encoding="utf-8")
+    runs = traces(short, space, sets, held_out)
+    figure(record, runs, short, folder / "figure.png")
+    print(text)
+    print(f"results in {folder}/")
+    if not result.healthy:
+        cli.fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
+
+
+def _parse() -> tuple[RunConfig, Namespace]:
+    parser = cli.build_parser(RunConfig, __doc__.splitlines()[0])
+    parser.add_argument(
+        "--keys",
+        nargs="+",
+        metavar="KEY",
+        help=f"what to tune; the gait's weights by default; of: {', '.join(KINDS)}",
+    )
+    parser.add_argument("--scenarios", type=int, default=16, help="to descend on")
+    parser.add_argument("--held-out", type=int, default=32, help="to choose the best point on")
+    parser.add_argument("--seconds", type=float, default=3.0, help="length of a scenario")
+    parser.add_argument("--pieces", type=int, default=2, help="velocities in a scenario's command")
+    parser.add_argument("--updates", type=int, default=150, help="of Adam, at most")
+    parser.add_argument("--rate", type=float, default=0.15, help="of Adam, in the log of a weight")
+    parser.add_argument("--patience", type=int, default=40, help="updates without improvement")
+    parser.add_argument("--minutes", type=float, default=15.0, help="wall time, at most")
+    parser.add_argument(
+        "--worsen",
+        type=float,
+        default=1.0,
+        metavar="FACTOR",
+        help="begin with every number off by this factor, up or down",
+    )
+    parser.add_argument("--worsen-seed", type=int, default=0, help="of which are up, which down")
+    parser.add_argument(
+        "--memory",
+        type=float,
+        default=0.1,
+        help="of the derivatives [s]; inf for the true ones, which a chaotic loop makes useless",
+    )
+    parser.add_argument("--baseline", action="store_true", help="CMA-ES in MuJoCo besides")
+    parser.add_argument("--seeds", type=int, default=16, help="of the walks in MuJoCo at the end")
+    config, args = cli.parse(RunConfig, parser)
+    args.speeds = min(config.command.velocities), max(config.command.velocities)
+    for name in ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
+                 "minutes", "worsen", "memory", "seeds"):  # fmt: skip
+        if not getattr(args, name) > 0:
+            cli.fail(f"--{name.replace('_', '-')}: got {getattr(args, name)}, wanted more than 0")
+    if config.sim.base != "planar":
+        cli.fail(f"sim.base: got '{config.sim.base}', wanted 'planar': the plant is planar")
+    gait = config.gait.names[0]
+    if args.keys is None:
+        if gait not in KEYS:
+            cli.fail(f"gait.names: got '{gait}', wanted one of {', '.join(KEYS)}, or give --keys")
+        args.keys = KEYS[gait]
+    return config, args
+
+
+def _settings(args: Namespace) -> list[Any]:
+    """Options that the descent depends on."""
+    names = ("keys", "scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
+             "worsen", "worsen_seed", "memory")  # fmt: skip
+    return [getattr(args, name) for name in names]
+
+
+def shortened(config: RunConfig, args: Namespace) -> RunConfig:
+    """The config of a scenario."""
+    command = CommandConfig(times=(0.0,), velocities=(0.0,))
+    return dataclasses.replace(config, duration=args.seconds, command=command)
+
+
+def worsened(space: Space, factor: float, seed: int) -> Variables:
+    """The config's variables, each number off by a factor, up or down at random."""
+    rng = np.random.default_rng(seed)
+    out = {}
+    for key, one in space.start.items():
+        if KINDS[key].unit is None:
+            out[key] = one + np.log(factor) * rng.choice([-1.0, 1.0], np.shape(one))
+        else:
+            out[key] = one / factor
+    return space.inside(out)
+
+
+def evolve(
+    config: RunConfig, space: Space, begin: Variables, args: Namespace, seconds: float,
+    folder: Path, identity: str,
+) -> dict[str, Any]:  # fmt: skip
+    """CMA-ES on batches of MuJoCo walks for some wall time [s]; kept after every generation."""
+    import cma
+
+    leaves, tree = jax.tree.flatten(begin)
+    sizes = np.cumsum([np.size(leaf) for leaf in leaves])[:-1]
+
+    def unflat(vector: np.ndarray) -> Variables:
+        parts = np.split(np.asarray(vector), sizes)
+        shaped = [p.reshape(np.shape(a)) for p, a in zip(parts, leaves, strict=True)]
+        return space.inside(jax.tree.unflatten(tree, shaped))
+
+    path = folder / "cma.pickle"
+    state: dict[str, Any] = {}
+    if path.exists():
+        state = pickle.loads(path.read_bytes())
+        if state["identity"] != identity:
+            cli.fail(f"{path} is of another tuning: take another folder, or remove it")
+    if not state:
+        mean = np.concatenate([np.ravel(leaf) for leaf in leaves])
+        search = cma.CMAEvolutionStrategy(mean, SIGMA, {"seed": 1, "verbose": -9})
+        state = {"identity": identity, "search": search, "seconds": 0.0, "history": [],
+                 "best": np.array(mean), "best_cost": np.inf}  # fmt: skip
+    search = state["search"]
+    walks = mujoco_scenarios(config, args)
+    engine = BatchEngine(walks[0], torques="held")
+    with tqdm(total=round(seconds), unit="s", desc="CMA-ES", disable=None) as bar:
+        while state["seconds"] < seconds and not search.stop():
+            clock = time.perf_counter()
+            asked = search.ask()
+            candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
+            recording = engine.run([
+                dataclasses.replace(c, command=w.command, seed=w.seed, sim=w.sim)
+                for c in candidates for w in walks
+            ])  # fmt: skip
+            if recording.interrupted:
+                raise KeyboardInterrupt
+            costs = recording_costs(recording).reshape(len(asked), len(walks)).mean(axis=1)
+            search.tell(asked, costs.tolist())
+            state["history"].append(float(costs.min()))
+            if costs.min() < state["best_cost"]:
+                at = int(np.argmin(costs))
+                state["best"], state["best_cost"] = np.array(asked[at]), float(costs[at])
+            state["seconds"] += time.perf_counter() - clock
+            scratch = path.with_name(path.name + ".part")
+            scratch.write_bytes(pickle.dumps(state))
+            scratch.replace(path)
+            bar.n = min(round(state["seconds"]), bar.total)
+            bar.set_postfix_str(f"cost {state['best_cost']:.3f}")
+    return {
+        "best": unflat(search.result.xfavorite if state["history"] else state["best"]),
+        "generations": len(state["history"]),
+        "population": search.popsize,
+        "episodes": len(state["history"]) * search.popsize * len(walks),
+        "seconds": state["seconds"],
+        "cost": state["history"],
+    }
+
+
+def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
+    """What a candidate of the baseline walks: the descent's commands, in MuJoCo."""
+    rng = np.random.default_rng(TRAIN_SEED)
+    low, high = args.speeds
+    times = tuple(float(i) * args.seconds / args.pieces for i in range(args.pieces))
+    return [
+        dataclasses.replace(
+            config,
+            seed=TRAIN_SEED + i,
+            sim=dataclasses.replace(config.sim, contacts="feet"),
+            command=CommandConfig(
+                times=times, velocities=tuple(map(float, rng.uniform(low, high, args.pieces)))
+            ),
+        )
+        for i in range(POPULATION_SEEDS)
+    ]
+
+
+def walk(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, Any]:
+    """The config's whole command in MuJoCo with some values, torques at every step."""
+    chosen = tuned_config(config, overrides)
+    configs = [dataclasses.replace(chosen, seed=seed) for seed in range(seeds)]
+    recording = BatchEngine(chosen).run(configs)
+    if recording.interrupted:
+        raise KeyboardInterrupt
+    rows = summarise(recording.metrics())
+    keep = ("velocity_rmse_mps", "pitch_p95_deg", "pitch_max_deg", "foot_slip_m",
+            "torque_saturation_fraction")  # fmt: skip
+    costs = recording_costs(recording)
+    return {
+        "runs": rows["runs"],
+        "falls": rows["falls"],
+        "cost_median": float(np.median(costs)),
+        **{key: rows[key] for key in keep if key in rows},
+    }
+
+
+def traces(
+    config: RunConfig, space: Space, sets: dict[str, Variables], scenarios: loop.Scenario
+) -> dict[str, Any]:
+    """The first held-out scenario with every set of numbers."""
+    run = jax.jit(loop.build_loop(config))
+    one = jax.tree.map(lambda a: a[0], scenarios)
+    return {name: jax.device_get(run(space.params(z), one)) for name, z in sets.items()}
+
+
+def table(record: dict[str, Any]) -> str:
+    """Markdown."""
+    lines = [
+        "| numbers | held-out cost, rigid body | MuJoCo: fell | RMSE of v_x [m/s] | "
+        "pitch, 95 % [deg] | cost |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, entry in record["mujoco"].items():
+
+        def cell(key: str, entry: dict[str, Any] = entry) -> str:
+            if key not in entry:
+                return "-"
+            return f"{entry[key]['median']:.3g} ({entry[key]['worst']:.3g})"
+
+        lines.append(
+            f"| {name} | {record['held_out_cost'][name]:.3f} | {entry['falls']} of "
+            f"{entry['runs']} | {cell('velocity_rmse_mps')} | {cell('pitch_p95_deg')} | "
+            f"{entry['cost_median']:.3f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path: Path) -> None:
+    """Loss curve; one held-out scenario before and after."""
+    fig, (curve, speed, pitch) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
+    descent, costs = record["descent"], record["held_out_cost"]
+    curve.plot(descent["cost"], lw=0.8, label="training scenarios")
+    curve.plot(descent["checks"], descent["held_out"], "o-", ms=2.5, label="held out")
+    curve.axhline(costs["own"], color="k", ls="--", lw=0.8, label="config's own numbers")
+    curve.set(xlabel="update of Adam", ylabel="cost [-]", yscale="log")
+    curve.legend(fontsize=7)
+    dt = config.lmpc.control_dt
+    first = next(iter(runs.values()))
+    time_axis = np.arange(len(first.x)) * dt
+    speed.plot(time_axis, first.wanted[:, 0], "k--", lw=0.9, label="reference")
+    for name, run in runs.items():
+        shown = np.where(run.alive[:, None], run.x, np.nan)
+        speed.plot(time_axis, shown[:, 3], lw=0.9, label=name)
+        pitch.plot(time_axis, np.degrees(shown[:, 2]), lw=0.9, label=name)
+    speed.set(xlabel="time [s]", ylabel="v_x [m/s]", title="a held-out scenario, rigid body")
+    pitch.set(xlabel="time [s]", ylabel="pitch [deg]")
+    speed.legend(fontsize=7)
+    for ax in (curve, speed, pitch):
+        ax.grid(alpha=0.3)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,36 @@
+"""The cost of ``kjax.tuning`` for what MuJoCo did, so that both are compared on the same scale."""
+
+import numpy as np
+
+from kjax.robots import go1
+from kjax.sim.recording import Recording
+from kjax.tuning.loop import CostWeights, Trace, cost
+
+
+def recording_costs(
+    recording: Recording,
+    weights: CostWeights = CostWeights(),  # noqa: B008
+) -> np.ndarray:
+    """Cost (B,) of every robot of a batch; ticks after its fall count as fallen.
+
+    Planned forces stand for those on the body: what joints or ground keep back of them shows in the
+    motion only.
+    """
+    log, ticks = recording.log, len(recording.qpos)
+    out = []
+    for robot, config in enumerate(recording.configs):
+        height = np.where(log.gait[:, robot] == 1, config.bound.height, config.lmpc.height)
+        force = np.asarray(log.force[:, robot])
+        trace = Trace(
+            x=log.x[:, robot],
+            wanted=np.stack([log.velocity_reference[:, robot], height], axis=1),  # type: ignore[arg-type]
+            feet=log.feet[:, robot],
+            stance=log.stance[:, robot],
+            mode=log.gait[:, robot],
+            force=force,  # type: ignore[arg-type]
+            missing=np.zeros_like(force),  # type: ignore[arg-type]
+            status=log.status[:, robot],
+            alive=np.arange(ticks) < recording.ticks[robot] - recording.fell[robot],
+        )
+        out.append(float(cost(go1.PARAMS, trace, weights)))
+    return np.array(out)

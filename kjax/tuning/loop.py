@@ -1,0 +1,312 @@
+"""A differentiable closed loop: the controller's own ``plan`` on the rigid body, over seconds.
+
+    x_{t+1} = plant(x_t, feet_t, u_t),   u_t = argmin QP(x_t + noise, params),   t = 0 .. T - 1
+
+A run is a pure function of the controller's parameters and a scenario. Stances, flights and
+touchdown times come from the schedule; where a foot comes down follows from the state. Derivatives
+go through all of it, the QPs' active sets as they are. Reverse mode keeps the states at the
+beginnings of some sqrt(T) segments and walks each segment again.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import ceil, exp, inf, sqrt
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from kjax.config import NoiseConfig, RunConfig
+from kjax.controller import ControllerState, build_controller, next_clock
+from kjax.legs import swing
+from kjax.params import ControllerParams
+from kjax.robots import go1
+from kjax.tuning import plant as body_plant
+from kjax.tuning.plant import PlantParams
+from kjax.types import STATE_DIM, Command, RobotParams
+
+# A body beyond these has fallen: what it does then is of no interest, and it is held still.
+MAX_PITCH = 1.0  # rad
+HEIGHTS = (0.10, 0.50)  # m
+
+
+class Scenario(NamedTuple):
+    """What a run meets; a leading axis makes a batch of them.
+
+    Attributes:
+      command: velocity over time.
+      x: (6,) start of the body [m, rad, m/s, rad/s].
+      plant: its numbers.
+      noise: (6,) standard deviation of what is measured of x [m, rad, m/s, rad/s].
+      key: of the noise, key data.
+    """
+
+    command: Command
+    x: Float[Array, "6"]
+    plant: PlantParams
+    noise: Float[Array, "6"]
+    key: UInt32[Array, "2"]
+
+
+class Trace(NamedTuple):
+    """A run, at the beginning of each control tick.
+
+    Attributes:
+      x: (T, 6) state [m, rad, m/s, rad/s].
+      wanted: (T, 2) reference of v_x [m/s] and mean height [m].
+      feet: (T, 4, 2) feet, world [m].
+      stance: (T, 4) legs that stand.
+      mode: (T,) contact mode.
+      force: (T, 4, 2) force of each leg on the body, body frame [N].
+      missing: (T, 4, 2) what joints and ground kept back of the planned ones [N].
+      status: (T,) of the QPs.
+      alive: (T,) whether the body has not fallen yet.
+    """
+
+    x: Float[Array, "T 6"]
+    wanted: Float[Array, "T 2"]
+    feet: Float[Array, "T 4 2"]
+    stance: Bool[Array, "T 4"]
+    mode: Int[Array, "T"]
+    force: Float[Array, "T 4 2"]
+    missing: Float[Array, "T 4 2"]
+    status: Int[Array, "T"]
+    alive: Bool[Array, "T"]
+
+
+Loop = Callable[[ControllerParams, Scenario], Trace]
+
+
+class _Carry(NamedTuple):
+    x: Array
+    feet: Array
+    state: ControllerState
+    alive: Array
+
+
+def build_loop(config: RunConfig, *, segment: int | None = None, memory: float = inf) -> Loop:
+    """The closed loop of a config, ``config.duration`` long.
+
+    A loop that is unstable over some ticks, a saturated limit cycle say, has derivatives that grow
+    with the run's length without end, true and of no use. ``memory`` fades what goes back through
+    the body's state: values stay as they are, derivatives are those of the last so many seconds.
+
+    Args:
+      config: of the controller; what concerns MuJoCo (sim, terrain, push, lateral) has no effect.
+      segment: control ticks between two states that reverse mode keeps; about sqrt(T) if ``None``.
+      memory: time in which the derivative through the state fades to 1/e; inf for the true one [s].
+
+    Raises:
+      ValueError: for a free base: the plant is planar.
+    """
+    if config.sim.base != "planar":
+        raise ValueError(f"sim.base must be 'planar' here, got '{config.sim.base}'")
+    # A tableau carried from tick to tick would be kept for every one of them.
+    config = replace(config, lmpc=replace(config.lmpc, warm_start=False))
+    controller = build_controller(config)
+    dt = config.lmpc.control_dt
+    ticks = max(1, round(config.duration / dt))
+    segment = ceil(sqrt(ticks)) if segment is None else min(segment, ticks)
+    if segment < 1:
+        raise ValueError(f"segment must be at least 1, got {segment}")
+    if not memory > 0:
+        raise ValueError(f"memory must be above 0 s, got {memory}")
+    segments = -(-ticks // segment)
+    keep = exp(-dt / memory)
+
+    def fade(x: Array) -> Array:
+        return x if keep == 1.0 else keep * x + (1.0 - keep) * jax.lax.stop_gradient(x)
+
+    def run(params: ControllerParams, scenario: Scenario) -> Trace:
+        params = params._replace(command=scenario.command)
+        robot, plant = params.robot, scenario.plant
+        key = jax.random.wrap_key_data(scenario.key)
+
+        def tick(carry: _Carry, number: Array) -> tuple[_Carry, Trace]:
+            x, state = carry.x, carry.state
+            error = scenario.noise * jax.random.normal(
+                jax.random.fold_in(key, number), (STATE_DIM,), x.dtype
+            )
+            feet = _touch_down(params, state, plant, carry, x + error, dt)
+            seen = body_plant.view(robot, plant.com, x + error, feet + error[:2])
+            always = jnp.ones((), bool)
+            state, info = controller.plan_from(params, state, seen, state.stance, always)
+            true = body_plant.view(robot, plant.com, x, feet).planar
+            force = body_plant.feasible(robot, plant, true, state.force)
+            sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+            moved = body_plant.advance(plant, state.stance, x, feet - sole, force, dt)
+            alive = carry.alive & _upright(moved)
+            record = Trace(
+                x=x,
+                wanted=jnp.stack([state.velocity, params.height[state.clock.gait]]),
+                feet=feet,
+                stance=state.stance,
+                mode=info.mode,
+                force=force,
+                missing=state.force - force,
+                status=info.status,
+                alive=carry.alive,
+            )
+            return _Carry(fade(jnp.where(alive, moved, x)), feet, state, alive), record
+
+        def stretch(carry: _Carry, numbers: Array) -> tuple[_Carry, Trace]:
+            return jax.lax.scan(tick, carry, numbers)
+
+        numbers = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
+        feet = _standing(params, plant, scenario.x)
+        state = controller.init_from(params, body_plant.view(robot, plant.com, scenario.x, feet))
+        first = _Carry(scenario.x, feet, state, jnp.ones((), bool))
+        _, trace = jax.lax.scan(jax.checkpoint(stretch), first, numbers)
+        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], trace)
+
+    return run
+
+
+def _upright(x: Array) -> Array:
+    low, high = HEIGHTS
+    return (jnp.abs(x[2]) < MAX_PITCH) & (x[1] > low) & (x[1] < high)
+
+
+def _standing(params: ControllerParams, plant: PlantParams, x: Array) -> Array:
+    """Feet (4, 2) of the robot before its first step: where they stand still."""
+    settings = swing.for_gait(params.swing, params.gaits[0])
+    along = x[0] - plant.com[0] + params.robot.hip_pos[:, 0] + settings.offset
+    return jnp.stack([along, jnp.full_like(along, params.robot.foot_radius)], axis=1)
+
+
+def _touch_down(
+    params: ControllerParams,
+    state: ControllerState,
+    plant: PlantParams,
+    carry: _Carry,
+    x: Array,
+    dt: float,
+) -> Array:
+    """Feet (4, 2) with those at their footholds whose stance begins now."""
+    clock = next_clock(params, state, dt)
+    where = (clock.gait, clock.phase)
+    landing = params.schedule.stance[where] & ~state.stance
+    robot = params.robot
+    along = swing.foothold(
+        robot,
+        swing.for_gait(params.swing, clock.gait),
+        body_plant.view(robot, plant.com, x, carry.feet).planar,
+        jnp.zeros((4,), x.dtype),
+        params.schedule.stance_time[where],
+        state.velocity + state.correction[0],
+    )
+    place = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
+    return jnp.where(landing[:, None], place, carry.feet)
+
+
+class CostWeights(NamedTuple):
+    """What one unit of the cost is.
+
+    The cost is the mean over time of e / (1 + e / fall), e the sum of the squares of these: near e
+    while the robot walks, and no state costs more than a fall.
+
+    Attributes:
+      velocity: error of v_x [m/s].
+      pitch: trunk's pitch from level [rad].
+      height: of the centre of mass from its mean [m].
+      effort: forces of all legs, root of the sum of squares, in weights of the robot [-].
+      missing: force that joints or ground kept back, likewise [-].
+      fall: cost of every tick after a fall [-].
+    """
+
+    velocity: float = 0.05
+    pitch: float = 0.05
+    height: float = 0.02
+    effort: float = 5.0
+    missing: float = 0.2
+    fall: float = 100.0
+
+
+def cost(robot: RobotParams, trace: Trace, weights: CostWeights = CostWeights()) -> Array:  # noqa: B008
+    """Cost of a run: tracking, pitch, height, effort, saturation, falls; see ``CostWeights``."""
+    weight = robot.mass * 9.81
+    error = jnp.stack(
+        [
+            (trace.x[:, 3] - trace.wanted[:, 0]) / weights.velocity,
+            trace.x[:, 2] / weights.pitch,
+            (trace.x[:, 1] - trace.wanted[:, 1]) / weights.height,
+        ]
+    )
+    forces = jnp.stack(
+        [
+            jnp.sum((trace.force / weight) ** 2, axis=(1, 2)) / weights.effort**2,
+            jnp.sum((trace.missing / weight) ** 2, axis=(1, 2)) / weights.missing**2,
+        ]
+    )
+    each = jnp.sum(error**2, axis=0) + jnp.sum(forces, axis=0)
+    each = each / (1.0 + each / weights.fall)
+    return jnp.mean(jnp.where(trace.alive, each, weights.fall))
+
+
+def draw_scenarios(
+    config: RunConfig,
+    seed: int,
+    count: int,
+    *,
+    speeds: tuple[float, float] = (0.0, 0.3),
+    pieces: int = 2,
+    mass_error: float = 0.1,
+    inertia_error: float = 0.2,
+    robot: RobotParams = go1.PARAMS,
+) -> Scenario:
+    """Random scenarios (count, ...): commands, starts, masses, inertias, noise.
+
+    Args:
+      config: duration, height, rigid body, size of the noise.
+      seed: of the draw.
+      count: of scenarios.
+      speeds: range of the commanded velocities [m/s].
+      pieces: of the command, equally long.
+      mass_error: largest relative error of the mass [-].
+      inertia_error: largest relative error of the inertia [-].
+      robot: whose plant it is.
+    """
+    rng = np.random.default_rng(seed)
+    noise = config.noise if config.noise.enabled else _silent()
+    gait = config.gait.names[0]
+    height = config.bound.height if gait == "bound" else config.lmpc.height
+    times = np.arange(pieces) * config.duration / pieces
+    nominal = body_plant.nominal_plant(
+        robot, config.srb.mass, config.srb.inertia, config.sim.friction
+    )
+
+    def uniform(size: float) -> np.ndarray:
+        return 1.0 + rng.uniform(-size, size, count)
+
+    x = np.zeros((count, STATE_DIM))
+    spread = [0, 0, noise.initial_pitch, *[noise.initial_velocity] * 2, noise.initial_pitch_rate]
+    x = x + rng.normal(size=x.shape) * np.asarray(spread)
+    x[:, 1] += height
+    scale = [*[noise.position] * 2, noise.pitch, *[noise.velocity] * 2, noise.pitch_rate]
+    plants = PlantParams(
+        mass=nominal.mass * uniform(mass_error),
+        inertia=nominal.inertia * uniform(inertia_error),
+        com=jnp.broadcast_to(nominal.com, (count, 2)),
+        friction=jnp.broadcast_to(nominal.friction, (count,)),
+    )
+    drawn = Scenario(
+        command=Command(
+            times=np.broadcast_to(times, (count, pieces)),  # type: ignore[arg-type]
+            velocities=rng.uniform(*speeds, (count, pieces)),  # type: ignore[arg-type]
+        ),
+        x=x,
+        plant=plants,
+        noise=np.broadcast_to(np.asarray(scale, float), (count, STATE_DIM)),  # type: ignore[arg-type]
+        key=rng.integers(0, 2**32, (count, 2), dtype=np.uint32),  # type: ignore[arg-type]
+    )
+    dtype = jnp.zeros(()).dtype
+    return jax.tree.map(
+        lambda a: jnp.asarray(a, dtype if jnp.asarray(a).dtype != jnp.uint32 else None), drawn
+    )
+
+
+def _silent() -> NoiseConfig:
+    zero = {name: 0.0 for name in NoiseConfig.__dataclass_fields__ if name != "enabled"}
+    return NoiseConfig(**zero)  # type: ignore[arg-type]

@@ -1,0 +1,66 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from kjax.legs.stance import stance_torque
+from kjax.robots import go1
+from kjax.tuning import plant
+
+PLANT = plant.nominal_plant(go1.PARAMS, 12.7, 0.39)
+X = jnp.array([0.3, 0.27, 0.1, 0.4, -0.2, 0.5])
+FEET = jnp.array([[0.5, 0.02], [0.46, 0.02], [0.12, 0.02], [0.08, 0.02]])
+
+
+def test_on_its_legs_the_body_moves_as_newton_and_euler_say():
+    stance = jnp.array([True, False, True, True])
+    force = jnp.array([[10.0, 80.0], [5.0, 99.0], [-20.0, 30.0], [-10.0, 60.0]])
+
+    def rate(_, x):
+        c, s = np.cos(x[2]), np.sin(x[2])
+        total, moment = np.zeros(2), 0.0
+        for leg in (0, 2, 3):
+            fx = c * force[leg, 0] - s * force[leg, 1]
+            fz = s * force[leg, 0] + c * force[leg, 1]
+            rx, rz = FEET[leg, 0] - x[0], FEET[leg, 1] - x[1]
+            total += np.array([fx, fz])
+            moment += rx * fz - rz * fx
+        return [*x[3:], total[0] / 12.7, total[1] / 12.7 - 9.81, moment / 0.39]
+
+    wanted = solve_ivp(rate, (0, 0.001), X, "DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    moved = plant.advance(PLANT, stance, X, FEET, force, 0.001)
+    # One Runge-Kutta step: 1.4e-8 at 5 ms, of fifth order.
+    np.testing.assert_allclose(moved, wanted, rtol=0, atol=1e-11)
+
+
+def test_the_view_puts_trunk_and_feet_where_the_body_says():
+    seen = plant.view(go1.PARAMS, PLANT.com, X, FEET).planar
+    np.testing.assert_allclose(seen.base + seen.rotation @ PLANT.com, X[:2], atol=1e-15)
+
+    def base(t):
+        x = X + t * jnp.concatenate([X[3:], jnp.zeros(3)])
+        return plant.view(go1.PARAMS, PLANT.com, x, FEET).planar.base
+
+    _, velocity = jax.jvp(base, (0.0,), (1.0,))
+    np.testing.assert_allclose(seen.base_vel, velocity, atol=1e-12)
+
+
+def test_forces_that_joints_and_ground_can_give_pass_unchanged():
+    body = plant.view(go1.PARAMS, PLANT.com, X, FEET).planar
+    force = jnp.tile(jnp.array([3.0, 30.0]), (4, 1))
+    np.testing.assert_allclose(plant.feasible(go1.PARAMS, PLANT, body, force), force, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "force", [[300.0, 100.0], [-300.0, 20.0], [0.0, 2000.0], [0.0, -50.0]], ids=str
+)
+def test_forces_beyond_friction_torque_or_a_pull_are_cut(force):
+    body = plant.view(go1.PARAMS, PLANT.com, X, FEET).planar
+    kept = plant.feasible(go1.PARAMS, PLANT, body, jnp.tile(jnp.array(force), (4, 1)))
+    world = np.asarray(kept @ body.rotation.T)
+    assert (world[:, 1] >= -1e-12).all()
+    assert (np.abs(world[:, 0]) <= 0.8 * world[:, 1] + 1e-9).all()
+    assert np.abs(kept - np.array(force)).max() > 1.0
+    torque = np.abs(stance_torque(go1.PARAMS, body.trig, kept))
+    assert (torque <= np.asarray(go1.PARAMS.torque_limit[1:]) * (1 + 1e-9)).all()
