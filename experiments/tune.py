@@ -2,8 +2,8 @@
 
 Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body on legs
 without mass, the controller's own plan, 200 QPs a second), with others held out. With --baseline
-CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time. Both results, the
-start and the config's own numbers then walk the config's whole command in MuJoCo on other seeds.
+CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time; with --refine it goes
+on from the descent's result. All results, the start and the config's own numbers then walk the config's whole command in MuJoCo on other seeds.
 Leaves tuned.toml, metrics.json, table.md and figure.png in the output folder. The state is kept
 there as well: the same command goes on after Ctrl-C or a kill.
 """
@@ -37,7 +37,7 @@ KEYS = {
 }
 TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
 POPULATION_SEEDS = 4  # MuJoCo episodes per candidate of the baseline
-SIGMA = 0.5  # of the baseline's first population, about a factor of 1.6
+SIGMA = 0.5  # of a first population, about a factor of 1.6
 
 
 def main() -> None:
@@ -79,12 +79,14 @@ def main() -> None:
           f"{result.best_cost:.3f} after update {result.best_update} (ended by: {result.stopped})",
           flush=True)  # fmt: skip
     sets = {"own": space.start, "start": begin, "gradient": result.best}
-    baseline = None
-    if args.baseline:
-        baseline = evolve(short, space, begin, args, result.seconds, folder, identity)
-        sets["CMA-ES"] = baseline["best"]
-        print(f"CMA-ES in MuJoCo: {baseline['generations']} generations of "
-              f"{baseline['population']} in {baseline['seconds']:.0f} s", flush=True)  # fmt: skip
+    searches: dict[str, dict[str, Any]] = {}
+    for name, first in evolutions(args, begin, result.best).items():
+        path = folder / f"{name.replace(', ', '_')}.pickle"
+        searches[name] = evolve(short, space, first, args, result.seconds, path, identity)
+        sets[name] = searches[name]["best"]
+        print(f"{name}: {searches[name]['generations']} generations of "
+              f"{searches[name]['population']} in MuJoCo in {searches[name]['seconds']:.0f} s",
+              flush=True)  # fmt: skip
     costs = {name: float(look(z)) for name, z in sets.items()}
     verdict = {name: walk(config, space.overrides(z), args.seeds) for name, z in sets.items()}
     cli.save_config(folder / "tuned.toml", tuned_config(config, space.overrides(result.best)))
@@ -101,7 +103,10 @@ def main() -> None:
             "best_update": result.best_update, "cost": result.cost,
             "checks": result.checks, "held_out": result.held_out,
         },
-        "baseline": baseline and {k: v for k, v in baseline.items() if k != "best"},
+        "searches": {
+            name: {k: v for k, v in found.items() if k != "best"}
+            for name, found in searches.items()
+        },
         "mujoco": verdict,
     }  # fmt: skip
     cli.save_json(folder / "metrics.json", record)
@@ -145,7 +150,16 @@ def _parse() -> tuple[RunConfig, Namespace]:
         default=0.1,
         help="of the derivatives [s]; inf for the true ones, which a chaotic loop makes useless",
     )
-    parser.add_argument("--baseline", action="store_true", help="CMA-ES in MuJoCo besides")
+    parser.add_argument(
+        "--baseline",
+        action="store_true",
+        help="CMA-ES in MuJoCo from the same start, for the same time",
+    )
+    parser.add_argument(
+        "--refine",
+        action="store_true",
+        help="CMA-ES in MuJoCo from where the descent ends, likewise",
+    )
     parser.add_argument("--seeds", type=int, default=16, help="of the walks in MuJoCo at the end")
     config, args = cli.parse(RunConfig, parser)
     args.speeds = min(config.command.velocities), max(config.command.velocities)
@@ -188,9 +202,15 @@ def worsened(space: Space, factor: float, seed: int) -> Variables:
     return space.inside(out)
 
 
+def evolutions(args: Namespace, begin: Variables, tuned: Variables) -> dict[str, Variables]:
+    """What CMA-ES is asked to do: names, and where it begins."""
+    asked = {"CMA-ES": begin} if args.baseline else {}
+    return asked | ({"gradient, then CMA-ES": tuned} if args.refine else {})
+
+
 def evolve(
     config: RunConfig, space: Space, begin: Variables, args: Namespace, seconds: float,
-    folder: Path, identity: str,
+    path: Path, identity: str,
 ) -> dict[str, Any]:  # fmt: skip
     """CMA-ES on batches of MuJoCo walks for some wall time [s]; kept after every generation."""
     import cma
@@ -203,7 +223,6 @@ def evolve(
         shaped = [p.reshape(np.shape(a)) for p, a in zip(parts, leaves, strict=True)]
         return space.inside(jax.tree.unflatten(tree, shaped))
 
-    path = folder / "cma.pickle"
     state: dict[str, Any] = {}
     if path.exists():
         state = pickle.loads(path.read_bytes())

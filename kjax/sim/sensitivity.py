@@ -64,10 +64,7 @@ def build_sensitivity(
     def roll(y: Array, ctrl: Array) -> Array:
         data = mjx.make_data(own)
         data = data.replace(qpos=y[:nq].astype(data.qpos.dtype), qvel=y[nq:], ctrl=ctrl)
-        for _ in range(steps) if steps == 1 else ():
-            data = mjx.step(own, data)
-        if steps > 1:
-            data = jax.lax.fori_loop(0, steps, lambda _, d: _same(mjx.step(own, d), d), data)
+        data = jax.lax.fori_loop(0, steps, lambda _, d: _same(mjx.step(own, d), d), data)
         return jnp.concatenate([data.qpos, data.qvel])
 
     def sensitivity(qpos: Array, qvel: Array, ctrl: Array) -> Sensitivity:

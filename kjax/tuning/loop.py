@@ -83,6 +83,7 @@ class _Carry(NamedTuple):
     x: Array
     feet: Array
     state: ControllerState
+    force: Array  # at the end of the last tick, before what joints and ground keep back
     alive: Array
 
 
@@ -134,7 +135,12 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             always = jnp.ones((), bool)
             state, info = controller.plan_from(params, state, seen, state.stance, always)
             true = body_plant.view(robot, plant.com, x, feet).planar
-            force = body_plant.feasible(robot, plant, true, state.force)
+            before = carry.force * state.stance[:, None]
+            pressed = body_plant.follow(plant, before, state.force, dt)
+            force = body_plant.feasible(robot, plant, true, pressed)
+            reached = state.force + (before - state.force) * jnp.exp(
+                -dt / jnp.maximum(plant.lag, 1e-3 * dt)
+            )
             sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
             moved = body_plant.advance(plant, state.stance, x, feet - sole, force, dt)
             alive = carry.alive & _upright(moved)
@@ -145,11 +151,12 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
                 stance=state.stance,
                 mode=info.mode,
                 force=force,
-                missing=state.force - force,
+                missing=pressed - force,
                 status=info.status,
                 alive=carry.alive,
             )
-            return _Carry(fade(jnp.where(alive, moved, x)), feet, state, alive), record
+            now = fade(jnp.where(alive, moved, x))
+            return _Carry(now, feet, state, reached, alive), record
 
         def stretch(carry: _Carry, numbers: Array) -> tuple[_Carry, Trace]:
             return jax.lax.scan(tick, carry, numbers)
@@ -157,7 +164,7 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
         numbers = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
         feet = _standing(params, plant, scenario.x)
         state = controller.init_from(params, body_plant.view(robot, plant.com, scenario.x, feet))
-        first = _Carry(scenario.x, feet, state, jnp.ones((), bool))
+        first = _Carry(scenario.x, feet, state, jnp.zeros_like(feet), jnp.ones((), bool))
         _, trace = jax.lax.scan(jax.checkpoint(stretch), first, numbers)
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], trace)
 
@@ -254,6 +261,7 @@ def draw_scenarios(
     pieces: int = 2,
     mass_error: float = 0.1,
     inertia_error: float = 0.2,
+    lag: float = 0.005,
     robot: RobotParams = go1.PARAMS,
 ) -> Scenario:
     """Random scenarios (count, ...): commands, starts, masses, inertias, noise.
@@ -266,6 +274,7 @@ def draw_scenarios(
       pieces: of the command, equally long.
       mass_error: largest relative error of the mass [-].
       inertia_error: largest relative error of the inertia [-].
+      lag: longest lag of the forces [s].
       robot: whose plant it is.
     """
     rng = np.random.default_rng(seed)
@@ -290,6 +299,7 @@ def draw_scenarios(
         inertia=nominal.inertia * uniform(inertia_error),
         com=jnp.broadcast_to(nominal.com, (count, 2)),
         friction=jnp.broadcast_to(nominal.friction, (count,)),
+        lag=rng.uniform(0.0, lag, count),  # type: ignore[arg-type]
     )
     drawn = Scenario(
         command=Command(

@@ -116,9 +116,9 @@ def descend(
     """
     import optax
 
-    for name, value in (("updates", updates), ("every", every), ("patience", patience)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    for name, count in (("updates", updates), ("every", every), ("patience", patience)):
+        if count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
     if not rate > 0:
         raise ValueError(f"rate must be above 0, got {rate}")
     schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.1)
@@ -194,7 +194,7 @@ class _Run:
 
     def __init__(self, variables: Variables, state: Any, best: Variables):
         self.variables, self.state, self.best = variables, state, best
-        self.best_cost = inf
+        self.best_cost: float = inf
         self.best_update = 0
         self.cost: list[float] = []
         self.checks: list[int] = []

@@ -25,16 +25,19 @@ class PlantParams(NamedTuple):
       inertia: about the centre of mass, pitch axis [kg m^2].
       com: (2,) centre of mass in the trunk frame [m].
       friction: of the ground [-].
+      lag: time constant with which a leg's force follows the planned one, from zero at touchdown;
+        0: at once. It stands for all that joints, feet and ground take their time for [s].
     """
 
     mass: Float[Array, ""]
     inertia: Float[Array, ""]
     com: Float[Array, "2"]
     friction: Float[Array, ""]
+    lag: Float[Array, ""]
 
 
 def nominal_plant(
-    robot: RobotParams, mass: float, inertia: float, friction: float = 0.8
+    robot: RobotParams, mass: float, inertia: float, friction: float = 0.8, lag: float = 0.0
 ) -> PlantParams:
     """The plant of a robot that stands: its centre of mass is that of the whole body.
 
@@ -43,6 +46,7 @@ def nominal_plant(
       mass: of the body [kg].
       inertia: of the body [kg m^2].
       friction: of the ground [-].
+      lag: of the forces [s].
     """
     standing = Observation(
         base_pos=jnp.zeros(3),
@@ -58,6 +62,7 @@ def nominal_plant(
         inertia=jnp.asarray(inertia, float),
         com=planar_state(robot, standing).x[:2],
         friction=jnp.asarray(friction, float),
+        lag=jnp.asarray(lag, float),
     )
 
 
@@ -96,6 +101,14 @@ def feasible(
     torque = stance_torque(robot, body.trig, held)
     excess = jnp.max(jnp.abs(torque) / robot.torque_limit[1:], axis=1)
     return held / jnp.maximum(excess, 1.0)[:, None]
+
+
+def follow(
+    plant: PlantParams, before: Float[Array, "4 2"], planned: Float[Array, "4 2"], dt: float
+) -> Float[Array, "4 2"]:
+    """Mean force (4, 2) of the next ``dt`` [s], on its way from ``before`` to ``planned`` [N]."""
+    ticks = dt / jnp.maximum(plant.lag, 1e-3 * dt)
+    return planned + (before - planned) * (1.0 - jnp.exp(-ticks)) / ticks
 
 
 def advance(

@@ -23,7 +23,8 @@ SECOND_FLIGHT, FIRST_FLIGHT = 3, 1  # of the paper's cycle
 
 def make(name="paper"):
     durations, modes = CYCLES[name]
-    return durations, modes, periodic_reference(durations, modes, FRONT, REAR, MASS, INERTIA)
+    made = periodic_reference(durations, modes, FRONT, REAR, MASS, INERTIA)
+    return durations, modes, type(made)(*map(np.asarray, made))
 
 
 def times(duration, count):

@@ -23,7 +23,7 @@ def descend(**options):
 
 
 def test_the_descent_finds_the_bottom():
-    result = descend(updates=250)
+    result = descend(updates=250, patience=250)
     for key, one in result.best.items():
         np.testing.assert_allclose(one, TARGET[key], atol=0.02)
     assert result.stopped == "updates"

@@ -64,3 +64,14 @@ def test_forces_beyond_friction_torque_or_a_pull_are_cut(force):
     assert np.abs(kept - np.array(force)).max() > 1.0
     torque = np.abs(stance_torque(go1.PARAMS, body.trig, kept))
     assert (torque <= np.asarray(go1.PARAMS.torque_limit[1:]) * (1 + 1e-9)).all()
+
+
+def test_a_force_follows_the_planned_one_as_a_first_order_lag_does():
+    slow = PLANT._replace(lag=jnp.asarray(0.004))
+    before, planned = jnp.array([[0.0, 0.0]] * 4), jnp.array([[8.0, 100.0]] * 4)
+    times = np.linspace(0.0, 0.005, 20001)
+    wanted = 100.0 * np.trapezoid(1.0 - np.exp(-times / 0.004), times) / 0.005
+    mean = plant.follow(slow, before, planned, 0.005)
+    np.testing.assert_allclose(mean[:, 1], wanted, rtol=1e-8)
+    np.testing.assert_allclose(mean[:, 0], 0.08 * wanted, rtol=1e-8)
+    np.testing.assert_allclose(plant.follow(PLANT, before, planned, 0.005), planned, rtol=2e-3)
