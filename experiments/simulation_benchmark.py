@@ -403,6 +403,6 @@ def figure(result: dict[str, Any], path: Path) -> None:
     ax.axhline(alone, color="0.5", lw=1, label="one robot in a Python loop")
     ax.set(xlabel="robots", ylabel="robot-steps per second",
            title=f"Flat trot, {result['threads']} threads")  # fmt: skip
-    ax.legend(fontsize=7)
+    ax.legend(fontsize=7, loc="center right")
     fig.savefig(path, dpi=120)
     plt.close(fig)

@@ -2,8 +2,10 @@
 
 Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body on legs
 without mass, the controller's own plan, 200 QPs a second), with others held out. With --baseline
-CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time; with --refine it goes
-on from the descent's result. All results, the start and the config's own numbers then walk the config's whole command in MuJoCo on other seeds.
+CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time; with --refine it
+goes on from the descent's result. All results, the start and the config's own numbers then walk the
+config's whole command in MuJoCo on other seeds.
+
 Leaves tuned.toml, metrics.json, table.md and figure.png in the output folder. The state is kept
 there as well: the same command goes on after Ctrl-C or a kill.
 """
@@ -49,7 +51,7 @@ def main() -> None:
     try:
         space = build_space(short, args.keys)
     except ValueError as error:
-        cli.fail(f"--keys: {error}")
+        cli.fail(f"--{error}" if str(error).startswith("keys") else str(error))
     begin = worsened(space, args.worsen, args.worsen_seed)
     identity = config_hash(short) + json.dumps([code_version(), *_settings(args)])
     train, held_out = (
