@@ -52,7 +52,7 @@ class Training(NamedTuple):
     Attributes:
       loss: (updates,) training loss: mean square of the many-step error of all states, in units of
         how far each of them moves [-].
-      held_out: (updates // every,) the same on held-out rollouts.
+      held_out: (updates // every,) the same on held-out rollouts, ``extra_loss`` included.
       diverged: whether the loss left the finite numbers; the model is the best one before.
     """
 
@@ -180,7 +180,8 @@ def train(
       batch: windows per update.
       rate: learning rate at first; it falls to a hundredth along a cosine.
       every: updates between two looks at the held-out rollouts.
-      extra_loss: further term of the loss, such as a closed loop's cost.
+      extra_loss: further term of the loss and of the choice of the best model, such as a closed
+        loop's cost.
 
     Returns:
       The model and how it went. Loss and held-out loss are in units of each state's spread of
@@ -225,6 +226,10 @@ def train(
         value = prediction_loss(model, jax.vmap(cut)(which, begin), unit)
         return value if extra_loss is None else value + extra_loss(model)
 
+    def judged(model: LearnedModel) -> Array:
+        value = prediction_loss(model, short, unit)
+        return value if extra_loss is None else value + extra_loss(model)
+
     schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.01)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
@@ -238,14 +243,14 @@ def train(
         inner, best, best_value = carry
         inner, values = jax.lax.scan(update, inner, keys)
         now = numbers._replace(layers=inner[0][0], head=inner[0][1])
-        value = prediction_loss(now, short, unit)
+        value = judged(now)
         better = value < best_value  # NaN is never better
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), inner[0], best)
         return (inner, best, jnp.where(better, value, best_value)), (values, value)
 
     checks = max(1, updates // every)
     keys = jax.random.split(key_loop, (checks, min(every, updates)))
-    first = prediction_loss(numbers, short, unit)
+    first = judged(numbers)
     parts = free(numbers)
     (_, best, _), (losses, held_out) = jax.lax.scan(
         stretch, ((parts, optimiser.init(parts)), parts, first), keys
