@@ -177,8 +177,8 @@ def table(result: dict[str, Any]) -> str:
         lines.append(
             f"| {name} | {e['compared']} | {e['rel_err_median']:.1e} ({e['rel_err_p90']:.1e}) | "
             f"{e['grad_norm_median']:.1e} | {e['finite_fraction']:.0%} of {result['scenarios']} | "
-            f"{e['value_s']:.2f} | "
-            f"{e['value_and_grad_s']:.2f} | {e['grad_over_value']:.2f} | {e['value_and_grad_MB']:.0f} |"
+            f"{e['value_s']:.2f} | {e['value_and_grad_s']:.2f} | {e['grad_over_value']:.2f} | "
+            f"{e['value_and_grad_MB']:.0f} |"
         )
     return "\n".join(lines) + "\n"
 

@@ -13,6 +13,7 @@ there as well: the same command goes on after Ctrl-C or a kill.
 import dataclasses
 import json
 import pickle
+import sys
 import time
 from argparse import Namespace
 from pathlib import Path
@@ -47,6 +48,15 @@ def main() -> None:
     config, args = _parse()
     cli.configure_jax()
     folder = cli.output_folder(args, "tune")
+    try:
+        tune(config, args, folder)
+    except KeyboardInterrupt:
+        print(f"interrupted; the same command goes on from what {folder}/ holds", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
+    """Descend, search, compare; leaves everything in the folder."""
     short, space = shortened(config, args), None
     try:
         space = build_space(short, args.keys)

@@ -39,7 +39,8 @@ def standing(model):
 
 
 @pytest.mark.slow
-def test_forward_derivatives_through_contact_are_c_mujocos(model, standing, steps=3):
+def test_forward_derivatives_through_contact_are_c_mujocos(model, standing):
+    steps = 3
     ours = jax.jit(build_sensitivity(model, steps))(*map(jnp.asarray, standing))
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = standing
