@@ -190,7 +190,8 @@ def table(walks: dict[str, Any]) -> str:
 
 
 def _interval(entry: dict[str, Any], name: str) -> str:
-    value, low, high = (entry[f"{name}_{part}"] for part in ("median", "low", "high"))
+    parts = (entry[f"{name}_{part}"] for part in ("median", "low", "high"))
+    value, low, high = np.array(list(parts), float)  # None, from a file, is NaN
     return "none stayed up" if np.isnan(value) else f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
@@ -207,7 +208,7 @@ def figure(walks: dict[str, Any], path: Path) -> None:
             (0.12, "tuned", "tuned"),
         ):
             value, low, high = (
-                np.array([e[key][f"rmse_{part}"] for e in own])
+                np.array([e[key][f"rmse_{part}"] for e in own], float)
                 for part in ("median", "low", "high")
             )
             at = np.arange(len(own)) + shift

@@ -5,6 +5,10 @@ import sys
 
 import pytest
 
+from kjax import RunConfig, load_config
+
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def tune(repository):
@@ -30,7 +34,6 @@ SMALL = (
 )  # fmt: skip
 
 
-@pytest.mark.slow
 def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(tune, tmp_path):
     done = tune(*SMALL, "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
@@ -41,8 +44,6 @@ def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(t
     assert record["descent"]["updates"] == 5
     assert len(record["values"]["start"]["lmpc.state_weights"]) == 6
     assert {p.name for p in tmp_path.iterdir()} >= {"tuned.toml", "table.md", "figure.png"}
-    from kjax import RunConfig, load_config
-
     tuned = load_config(RunConfig, tmp_path / "tuned.toml")
     assert list(tuned.lmpc.state_weights) == pytest.approx(
         record["values"]["gradient"]["lmpc.state_weights"]
