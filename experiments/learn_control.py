@@ -91,12 +91,18 @@ def _parse() -> argparse.Namespace:
     parser = cli.script_parser(__doc__.splitlines()[0])
     parser.add_argument("--head", choices=("linear", "bilinear"), default="linear")
     parser.add_argument("--updates", type=int, default=600, help="of Adam")
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=1e-5,
+        help="of Adam; the least-squares head is lost above 1e-4",
+    )
     parser.add_argument("--scenarios", type=int, default=4, help="closed loops per update")
     parser.add_argument("--seconds", type=float, default=0.6, help="length of each")
     parser.add_argument("--weight", type=float, default=0.1, help="of the closed loops' cost")
     parser.add_argument("--walks", type=int, default=16, help="seeds in MuJoCo")
     args = parser.parse_args()
-    for name in ("updates", "scenarios", "seconds", "weight", "walks"):
+    for name in ("updates", "rate", "scenarios", "seconds", "weight", "walks"):
         if not getattr(args, name) > 0:
             cli.fail(f"--{name}: got {getattr(args, name)}, wanted more than 0")
     return args
