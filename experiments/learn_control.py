@@ -132,7 +132,14 @@ def draw(seed: int, rollouts: int) -> Any:
 
 def train(args: argparse.Namespace, data: Any, extra: Any) -> tuple[Any, learned.Training]:
     """A model and how its training went; the same random numbers with and without ``extra``."""
-    fit = partial(learned.train, head=args.head, updates=args.updates, window=50, extra_loss=extra)
+    fit = partial(
+        learned.train,
+        head=args.head,
+        updates=args.updates,
+        rate=args.rate,
+        window=50,
+        extra_loss=extra,
+    )
     return jax.device_get(jax.jit(fit)(jax.random.key(3), data))
 
 
