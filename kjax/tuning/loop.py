@@ -25,7 +25,7 @@ from kjax.params import ControllerParams
 from kjax.robots import go1
 from kjax.tuning import plant as body_plant
 from kjax.tuning.plant import PlantParams
-from kjax.types import STATE_DIM, Command, RobotParams
+from kjax.types import GRAVITY, STATE_DIM, Command, RobotParams
 
 # A body beyond these has fallen: what it does then is of no interest, and it is held still.
 MAX_PITCH = 1.0  # rad
@@ -233,7 +233,7 @@ class CostWeights(NamedTuple):
 
 def cost(robot: RobotParams, trace: Trace, weights: CostWeights = CostWeights()) -> Array:  # noqa: B008
     """Cost of a run: tracking, pitch, height, effort, saturation, falls; see ``CostWeights``."""
-    weight = robot.mass * 9.81
+    weight = robot.mass * GRAVITY
     error = jnp.stack(
         [
             (trace.x[:, 3] - trace.wanted[:, 0]) / weights.velocity,
