@@ -136,11 +136,8 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             state, info = controller.plan_from(params, state, seen, state.stance, always)
             true = body_plant.view(robot, plant.com, x, feet).planar
             before = carry.force * state.stance[:, None]
-            pressed = body_plant.follow(plant, before, state.force, dt)
+            pressed, reached = body_plant.follow(plant, before, state.force, dt)
             force = body_plant.feasible(robot, plant, true, pressed)
-            reached = state.force + (before - state.force) * jnp.exp(
-                -dt / jnp.maximum(plant.lag, 1e-3 * dt)
-            )
             sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
             moved = body_plant.advance(plant, state.stance, x, feet - sole, force, dt)
             alive = carry.alive & _upright(moved)

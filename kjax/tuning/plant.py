@@ -105,10 +105,12 @@ def feasible(
 
 def follow(
     plant: PlantParams, before: Float[Array, "4 2"], planned: Float[Array, "4 2"], dt: float
-) -> Float[Array, "4 2"]:
-    """Mean force (4, 2) of the next ``dt`` [s], on its way from ``before`` to ``planned`` [N]."""
+) -> tuple[Float[Array, "4 2"], Float[Array, "4 2"]]:
+    """Mean force of the next ``dt`` [s] and force at its end, from ``before`` to ``planned`` [N]."""
     ticks = dt / jnp.maximum(plant.lag, 1e-3 * dt)
-    return planned + (before - planned) * (1.0 - jnp.exp(-ticks)) / ticks
+    left = jnp.exp(-ticks)
+    gap = before - planned
+    return planned + gap * (1.0 - left) / ticks, planned + gap * left
 
 
 def advance(

@@ -71,7 +71,8 @@ def test_a_force_follows_the_planned_one_as_a_first_order_lag_does():
     before, planned = jnp.array([[0.0, 0.0]] * 4), jnp.array([[8.0, 100.0]] * 4)
     times = np.linspace(0.0, 0.005, 20001)
     wanted = 100.0 * np.trapezoid(1.0 - np.exp(-times / 0.004), times) / 0.005
-    mean = plant.follow(slow, before, planned, 0.005)
+    mean, end = plant.follow(slow, before, planned, 0.005)
     np.testing.assert_allclose(mean[:, 1], wanted, rtol=1e-8)
     np.testing.assert_allclose(mean[:, 0], 0.08 * wanted, rtol=1e-8)
-    np.testing.assert_allclose(plant.follow(PLANT, before, planned, 0.005), planned, rtol=2e-3)
+    np.testing.assert_allclose(end, planned * (1.0 - np.exp(-0.005 / 0.004)), rtol=1e-12)
+    np.testing.assert_allclose(plant.follow(PLANT, before, planned, 0.005)[0], planned, rtol=2e-3)
