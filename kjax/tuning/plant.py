@@ -106,7 +106,7 @@ def feasible(
 def follow(
     plant: PlantParams, before: Float[Array, "4 2"], planned: Float[Array, "4 2"], dt: float
 ) -> tuple[Float[Array, "4 2"], Float[Array, "4 2"]]:
-    """Mean force of the next ``dt`` [s] and force at its end, from ``before`` to ``planned`` [N]."""
+    """Mean force of the next ``dt`` [s], and that at its end, from ``before`` to ``planned``."""
     ticks = dt / jnp.maximum(plant.lag, 1e-3 * dt)
     left = jnp.exp(-ticks)
     gap = before - planned
