@@ -3,10 +3,11 @@
 Fits or builds every model of kjax.koopman on the same data, rolls it out from 50 random starts
 under 50 random force profiles, and reports the error against the horizon, as the model itself and
 as an LMPC uses it (linearised at the start). Leaves metrics.json, details.json (all statistics),
-table.md and figure.png.
+table.md and figure.png. With --whole-body, metrics.json holds the residual's two ratios as well.
 """
 
 import argparse
+import json
 import time
 from functools import partial
 from pathlib import Path
@@ -44,7 +45,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="less of it: to check the script")
     parser.add_argument("--no-learned", action="store_true", help="leave out the networks")
     parser.add_argument("--seed", type=int, default=1, help="of the training data")
+    parser.add_argument("--whole-body", type=Path, metavar="DIR", help="results of whole_body.py")
     args = parser.parse_args()
+    residual = {} if args.whole_body is None else residual_ratios(args.whole_body)
     folder = cli.output_folder(args, "koopman_study")
     cli.configure_jax()
     jax.config.update("jax_enable_x64", True)
@@ -52,11 +55,22 @@ def main() -> None:
     result = study(args)
     (folder / "table.md").write_text(table(result), encoding="utf-8")
     figure(result, folder / "figure.png")
-    record = {"provenance": cli.provenance(), **summary(result), **compact(result)}
+    record = {"provenance": cli.provenance(), **summary(result), **residual, **compact(result)}
     cli.save_json(folder / "metrics.json", record)
     cli.save_json(folder / "details.json", result)
     print(table(result))
     print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+
+
+def residual_ratios(folder: Path) -> dict[str, float]:
+    """What a residual leaves of the rigid body's error on the whole robot, from whole_body.py."""
+    file = folder / "metrics.json"
+    names = ("residual_velocity_ratio_50ms", "residual_pitch_rate_ratio_50ms")
+    try:
+        there = json.loads(file.read_text(encoding="utf-8"))
+        return {name: float(there[name]) for name in names}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        cli.fail(f"--whole-body: no results of whole_body.py in {file}: {error!r}")
 
 
 def study(args: argparse.Namespace) -> dict[str, Any]:
@@ -144,7 +158,7 @@ def fit_all(
         heads: tuple[learned.Head, ...] = ("linear", "bilinear")
         for head in heads:
             fit = jax.jit(
-                partial(learned.train, head=head, updates=100 if args.quick else 2000, window=50)
+                partial(learned.train, head=head, updates=100 if args.quick else 4000, window=50)
             )
             model, how = fit(jax.random.key(7), data)
             if bool(how.diverged):

@@ -137,6 +137,22 @@ def _least_squares(numbers: LearnedModel, data: Snapshots, head: Head) -> Biline
     return BilinearModel(A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=B, B_feet=none)
 
 
+def _units(numbers: LearnedModel, data: Snapshots) -> tuple[tuple[Layer, ...], BilinearModel]:
+    """What a change of 1 means for each trained number: that of the network's is its own.
+
+    An entry of the head is measured by the change of its observable in a step over the size of
+    what it multiplies: one rate then suits a velocity's response to a newton and a wave's decay.
+    """
+    lifted = jax.vmap(jax.vmap(lambda x: lift(numbers, x)))(data.states)
+    change = jnp.diff(lifted, axis=1).std(axis=(0, 1))
+    size = jnp.sqrt((lifted**2).mean(axis=(0, 1)))
+    force = data.inputs.std(axis=(0, 1))
+    A = change[:, None] / (size + 1e-9)
+    B = A[:, :, None].swapaxes(0, 1) / (force + 1e-9)
+    layers = jax.tree.map(jnp.ones_like, numbers.layers)
+    return layers, BilinearModel(A, B, jnp.zeros_like(numbers.head.B_feet))
+
+
 def prediction_loss(
     numbers: LearnedModel, data: Snapshots, unit: Float[Array, "6"]
 ) -> Float[Array, ""]:
@@ -163,7 +179,7 @@ def train(
     window: int = 20,
     updates: int = 1000,
     batch: int = 64,
-    rate: float = 1e-3,
+    rate: float = 1e-2,
     every: int = 50,
     extra_loss: Callable[[LearnedModel], Float[Array, ""]] | None = None,
 ) -> tuple[LearnedModel, Training]:
@@ -178,7 +194,8 @@ def train(
       window: steps of a prediction in the loss.
       updates: of Adam.
       batch: windows per update.
-      rate: learning rate at first; it falls to a hundredth along a cosine.
+      rate: of Adam at first, in what each number moves by itself (see ``_units``); it falls to a
+        hundredth along a cosine.
       every: updates between two looks at the held-out rollouts.
       extra_loss: further term of the loss and of the choice of the best model, such as a closed
         loop's cost.
@@ -232,12 +249,16 @@ def train(
 
     schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.01)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+    units = _units(numbers, fit)
+
+    def scaled(parts: Any) -> Any:
+        return jax.tree.map(jnp.multiply, parts, units)
 
     def update(carry: Any, key: Array) -> tuple[Any, Array]:
         parts, state = carry
         value, slope = jax.value_and_grad(loss)(parts, key)
-        change, state = optimiser.update(slope, state)
-        return (optax.apply_updates(parts, change), state), value
+        change, state = optimiser.update(scaled(slope), state)
+        return (optax.apply_updates(parts, scaled(change)), state), value
 
     def stretch(carry: Any, keys: Array) -> tuple[Any, tuple[Array, Array]]:
         inner, best, best_value = carry
