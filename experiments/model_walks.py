@@ -13,6 +13,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from prediction_models import MODELS, residual
 
 from kjax import cli
 from kjax.config import RunConfig, load_config
@@ -21,17 +22,6 @@ from kjax.episodes import code_version
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
 SPEEDS = {"trot": (0.0, 0.3, 0.6), "bound": (0.0, 0.5, 0.8)}  # m/s, one after the other
-MODELS: dict[str, dict[str, Any]] = {
-    "linear (the paper)": {"koopman.model": "linear"},
-    "linear, measured feet": {"koopman.model": "linear", "koopman.feet": "measured"},
-    "SRB at hover": {"koopman.model": "srb_hover", "koopman.feet": "measured"},
-    "SRB re-linearised": {"koopman.model": "srb", "koopman.feet": "measured"},
-    "planted SRB": {"koopman.model": "planted", "koopman.feet": "measured"},
-    "exact bilinear": {"koopman.model": "exact", "koopman.feet": "measured"},
-    "bilinear EDMD": {
-        "koopman.model": "bilinear", "koopman.feet": "measured", "koopman.constant_rotation": True,
-    },
-}  # fmt: skip
 TUNE_SEEDS, REPORT_SEEDS = range(100, 104), range(16)
 SETS = 32  # weight sets, the config's own among them
 FALL = 10.0  # cost of a fall, in rmse of 1 m/s
@@ -42,7 +32,7 @@ def main() -> None:
     parser = cli.script_parser(__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="two models, few sets and seeds")
     parser.add_argument("--residual", type=Path, metavar="DIR", help="results of whole_body.py: "
-                        "walk with its residual as well")  # fmt: skip
+                        "walk with its residuals as well")  # fmt: skip
     parser.add_argument("--gaits", nargs="+", choices=GAITS, default=list(GAITS))
     args = parser.parse_args()
     folder = cli.output_folder(args, "model_walks")
@@ -74,17 +64,14 @@ def main() -> None:
 
 def models_of(gait: str, args: Any) -> dict[str, dict[str, Any]]:
     """Config keys of the models to walk with."""
-    models = dict(list(MODELS.items())[:1] + list(MODELS.items())[3:4]) if args.quick else MODELS
+    names = ("linear (the paper)", "SRB re-linearised") if args.quick else MODELS
+    models = {name: MODELS[name] for name in names}
     if args.residual is not None and gait == "trot":  # its step of 5 ms is no bound's
-        file = args.residual / f"residual_{gait}.npz"
-        if not file.exists():
-            cli.fail(f"--residual: no {file.name} in {args.residual}")
-        models = models | {
-            "planted SRB + residual": {
-                "koopman.model": "residual", "koopman.file": str(file.resolve()),
-                "koopman.feet": "measured", "koopman.dataset.dt": 0.005,
-            }
-        }  # fmt: skip
+        for end, name in (("", "affine"), ("_clock_history", "clock, last force")):
+            file = args.residual / f"residual_{gait}{end}.npz"
+            if not file.exists():
+                cli.fail(f"--residual: no {file.name} in {args.residual}")
+            models[f"planted SRB + residual ({name})"] = residual(str(file.resolve()))
     return models
 
 

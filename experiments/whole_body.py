@@ -5,8 +5,10 @@ fits a residual on the planted rigid body in each contact mode, and tests it on 
 open-loop predictions of 25 and 50 ms under the recorded forces, inside a stance and over all start
 points. Half of the episodes are fitted on, a fifth chooses between fits, and 30 % report.
 
-Leaves metrics.json (ratios), details.json, figure.png and, for each gait, residual_<gait>.npz (the
-affine residual, for koopman.model = "residual" with koopman.dataset.dt = 0.005) and
+Leaves metrics.json (ratios), table.md (every model that an LMPC can predict with), details.json,
+figure.png and, for each gait, residual_<gait>.npz and
+residual_<gait>_clock_history.npz (the affine residual and the one that knows the place in the phase
+and the last force, for koopman.model = "residual" with koopman.dataset.dt = 0.005) and
 weights_<gait>.npz (all models). The recordings stay there as well and are used again while their
 configs are the same.
 """
@@ -16,13 +18,26 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from prediction_models import MODELS as MODEL_KEYS
+from prediction_models import residual
 
 from kjax import cli, srb
 from kjax.config import RunConfig, SrbConfig, load_config, to_dict
 from kjax.koopman import open_loop, storage, whole_body
-from kjax.koopman.whole_body import Episode, Features, Transitions
+from kjax.koopman.features import (
+    Features,
+    affine,
+    clock,
+    clock_history,
+    history,
+    touchdown,
+)
+from kjax.koopman.prediction import build_family
+from kjax.koopman.whole_body import Episode, Transitions
+from kjax.params import fit_models
 from kjax.robots import go1
 from kjax.types import Mode
 
@@ -49,12 +64,13 @@ KINDS = {
 }
 GAITS = {"trot": ("trot", "trot_rough"), "bound": ("bound", "bound_rough")}
 MODELS: dict[str, Features] = {
-    "affine": whole_body.affine,
-    "history": whole_body.history,
-    "clock": whole_body.clock,
-    "clock_history": whole_body.clock_history,
-    "touchdown": whole_body.touchdown(DT),
+    "affine": affine,
+    "history": history,
+    "clock": clock,
+    "clock_history": clock_history,
+    "touchdown": touchdown(DT),
 }
+KEPT = ("affine", "clock_history")  # for koopman.file
 LABELS = {
     "nominal": "rigid body, feet planted",
     "affine": "+ affine residual",
@@ -83,19 +99,22 @@ def main() -> None:
     folder = cli.output_folder(args, "whole_body")
     metrics: dict[str, Any] = {}
     curves: dict[str, Any] = {}
+    families: dict[str, Any] = {}
     for gait, kinds in GAITS.items():
         used = kinds[:1] if args.quick else kinds
         try:
             recordings = {kind: record(kind, args, folder) for kind in used}
-            metrics[gait], curves[gait], fits = study(gait, recordings)
+            metrics[gait], curves[gait], fits, held = study(gait, recordings)
         except KeyboardInterrupt:
             print(f"stopped; finished recordings are kept in {folder}/, run again to go on")
             raise SystemExit(130) from None
-        affine = fits["affine"]
-        storage.save(
-            folder / f"residual_{gait}.npz",
-            storage.Stored("residual", DT, affine.W, np.nan_to_num(affine.after)),
-        )
+        for name in KEPT:
+            fit, end = fits[name], "" if name == "affine" else f"_{name}"
+            storage.save(
+                folder / f"residual_{gait}{end}.npz",
+                storage.Stored("residual", DT, fit.W, np.nan_to_num(fit.after), name),
+            )
+        families[gait] = compare(gait, held, folder, args.quick)
         weights = {name: fit.W for name, fit in fits.items()}
         np.savez(folder / f"weights_{gait}.npz", dt=DT, **weights)
     chosen = metrics["trot"]["chosen_inside"]
@@ -110,12 +129,14 @@ def main() -> None:
         "duration_s": args.duration,
         "force_noise_n": args.force,
         **{gait: compact(entry) for gait, entry in metrics.items()},
+        "families": families,
         "provenance": cli.provenance(),
     }
+    (folder / "table.md").write_text(table(families), encoding="utf-8")
     cli.save_json(folder / "metrics.json", result)
     cli.save_json(folder / "details.json", metrics)
     save_figure(curves, folder / "figure.png")
-    print(f"\nresults in {folder}/")
+    print(f"\n{table(families)}\nresults in {folder}/")
 
 
 def compact(entry: dict[str, Any]) -> dict[str, Any]:
@@ -214,16 +235,13 @@ def _episodes(arrays: dict[str, np.ndarray]) -> list[Episode]:
 
 def study(
     gait: str, recordings: dict[str, list[Episode]]
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, whole_body.Fit]]:
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, whole_body.Fit], Transitions]:
     """Fit and test the models of a gait.
 
     Returns:
-      Metrics; error curves over time; the fits.
+      Metrics; error curves over time; the fits; transitions of the episodes held out.
     """
-    config = SrbConfig()
-    body = srb.SrbParams(
-        mass=jnp.asarray(config.mass), inertia=jnp.asarray(config.inertia), feet=jnp.zeros((2, 2))
-    )
+    body = _body()
     subset: dict[int, str] = {}
     episodes: list[Episode] = []
     for kind, those in recordings.items():
@@ -289,7 +307,74 @@ def study(
                             key: np.sqrt(value[calm].mean(axis=0)) for key, value in errors.items()
                         }
         _print(gait, where, out[where])
-    return out, curves, fits
+    return out, curves, fits, held
+
+
+def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str, Any]:
+    """Every model that an LMPC can predict with, as it would, inside a stance.
+
+    Returns:
+      Model -> horizon -> rms error of velocity and pitch rate, and its ratio to that of the
+      planted rigid body (not linearised) with the interval.
+    """
+    unlike = "linear, cautious"  # the paper's, weighed otherwise
+    names = list(MODEL_KEYS)[:1] if quick else [name for name in MODEL_KEYS if name != unlike]
+    chosen = {name: MODEL_KEYS[name] for name in names}
+    for end, name in (("", "affine"), ("_clock_history", "clock, last force")):
+        file = folder / f"residual_{gait}{end}.npz"
+        chosen[f"planted SRB + residual ({name})"] = residual(str(file))
+    out: dict[str, Any] = {}
+    views = {
+        name: open_loop.windows(held, n, inside=True, stride=2) for name, n in HORIZONS.items()
+    }
+    nominal = {name: _errors(view, _body(), None, None, None) for name, view in views.items()}
+    for label, keys in chosen.items():
+        # The LMPC's own step plays no part, but must suit the model's.
+        config = load_config(
+            RunConfig, CONFIGS / KINDS[gait].config, {**keys, "lmpc.model_dt": 0.02}
+        )
+        with jax.enable_x64(True):
+            fits = fit_models(config, go1.PARAMS)
+            family = build_family(config.koopman)
+            own = fits.model if fits.prediction is None else fits.prediction.numbers
+            force = np.zeros((len(Mode), 4)) if fits.prediction is None else fits.prediction.force
+            feet = fits.feet if config.koopman.feet == "fixed" else None
+            for name, view in views.items():
+                predicted = open_loop.predict_as_lmpc(
+                    view, family, jax.tree.map(jnp.asarray, own), jnp.asarray(force),
+                    steps=round(DT / config.koopman.dataset.dt),
+                    feet=None if feet is None else jnp.asarray(feet),
+                )  # fmt: skip
+                errors = open_loop.squared_errors(view, predicted)
+                calm = ~view.disturbed
+                ratios = _ratios(errors, nominal[name], view.episode, calm)
+                out.setdefault(label, {})[name] = {
+                    key: ratios[key] for key in ("velocity", "omega")
+                }
+    return out
+
+
+def table(families: dict[str, Any]) -> str:
+    """Rms errors of every model inside a stance, as Markdown."""
+    heads = [f"{gait}, {name}" for gait in families for name in HORIZONS]
+    lines = [
+        "| inside a stance of the whole robot, as an LMPC predicts | "
+        + " | ".join(f"{head}: velocity [m/s], ratio; pitch rate [rad/s], ratio" for head in heads)
+        + " |",
+        "|---" * (1 + len(heads)) + "|",
+    ]
+    for label in next(iter(families.values())):
+        cells = []
+        for models in families.values():
+            for name in HORIZONS:
+                entry = models[label][name]
+                cells.append("; ".join(
+                    f"{e['rms']:.3f}, {e['ratio']:.2f} ({e['interval'][0]:.2f} to "
+                    f"{e['interval'][1]:.2f})" for e in (entry["velocity"], entry["omega"])
+                ))  # fmt: skip
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    lines.append("\nRatio: to the error of the planted rigid body, integrated, not linearised.")
+    return "\n".join(lines) + "\n"
 
 
 def _choose(
@@ -329,6 +414,13 @@ def _choose(
     return best[1], best[2], best[0]
 
 
+def _body() -> srb.SrbParams:
+    config = SrbConfig()
+    return srb.SrbParams(
+        mass=jnp.asarray(config.mass), inertia=jnp.asarray(config.inertia), feet=jnp.zeros((2, 2))
+    )
+
+
 def _at_end(squared: np.ndarray, rows: np.ndarray) -> float:
     return float(squared[rows, -1].mean())
 
@@ -341,7 +433,7 @@ def _errors(
     landing: open_loop.Landing | None,
 ) -> dict[str, np.ndarray]:
     W = None if fit is None else fit.W
-    own = whole_body.affine if features is None else features
+    own = affine if features is None else features
     predicted = open_loop.predict(views, body, dt=DT, W=W, features=own, landing=landing)
     return open_loop.squared_errors(views, predicted)
 

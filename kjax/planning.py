@@ -141,7 +141,12 @@ def _build_stance_planner(config: RunConfig) -> Planner:
                 friction=lmpc.friction,
                 torque_fraction=lmpc.torque_fraction,
             )
-        z, model = model_here(params, task.mode, Start(body.x, feet))
+        rate = jnp.pi / gait.phase_duration(params.schedule, clock)
+        # Legs that have just come down pressed nothing before.
+        fresh = clock.elapsed < 0.5 * lmpc.control_dt
+        last = jnp.where(fresh, 0.0, task.memory.plan[:4])
+        start = Start(body.x, feet, last, rate * clock.elapsed, rate)
+        z, model = model_here(params, task.mode, start)
         solution = solve_lmpc(
             params.tables, task.mode, z, reference, task.memory, lmpc, model=model, rows=rows
         )

@@ -22,6 +22,7 @@ jax.config.update("jax_enable_x64", True)
 from kjax import RunConfig, load_config, srb  # noqa: E402
 from kjax.config import SrbConfig  # noqa: E402
 from kjax.koopman import open_loop, whole_body  # noqa: E402
+from kjax.koopman.features import affine, clock_history  # noqa: E402
 from kjax.robots import go1  # noqa: E402
 from kjax.sim.batch_loop import BatchEngine  # noqa: E402
 
@@ -77,12 +78,12 @@ train, test = whole_body.split(np.arange(ROBOTS), share=0.33)
 fitted, held = (data.rows(np.isin(data.episode, own)) for own in (train, test))
 config = SrbConfig()
 body = srb.SrbParams(jnp.asarray(config.mass), jnp.asarray(config.inertia), jnp.zeros((2, 2)))
-models = {"affine": whole_body.affine, "with clock and last force": whole_body.clock_history}
+models = {"affine": affine, "with clock and last force": clock_history}
 fits = {
     name: whole_body.fit(fitted, body, dt=DT, features=features, steps=5)
     for name, features in models.items()
 }
-gains = whole_body.force_gains(fits["affine"], fitted, body, dt=DT, features=whole_body.affine)
+gains = whole_body.force_gains(fits["affine"], fitted, body, dt=DT, features=affine)
 print("part of the planned force (F_x, F_z) that arrives in a trot:", np.round(gains[3], 2))
 
 # %% [markdown]

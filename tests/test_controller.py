@@ -1,5 +1,6 @@
 """The controller as a set of pure functions: rates, shapes, purity, faults."""
 
+import dataclasses
 import itertools
 
 import chex
@@ -9,6 +10,10 @@ import numpy as np
 import pytest
 
 from kjax import Observation, RunConfig, build_controller, build_params, load_config, qp
+from kjax.config import DatasetConfig, KoopmanConfig, LmpcConfig
+from kjax.koopman import families, prediction, storage
+from kjax.legs.base import build_base
+from kjax.mpc.lmpc import reference_trajectory, solve_lmpc
 from kjax.params import build_gaits
 from kjax.robots import go1
 from kjax.types import Leg, Mode
@@ -543,3 +548,65 @@ def test_measured_feet_and_fixed_feet_agree_where_the_feet_are_nominal(controlle
 
 def _start(controller, params, observation):
     return params, controller.init(params, observation), observation
+
+
+def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_path):
+    """The second plan is that of the same LMPC with the model started by hand."""
+    rng = np.random.default_rng(0)
+    W = np.zeros((len(Mode), 6, 29))
+    W[Mode.TROT, 3:] = 2e-3 * rng.normal(size=(3, 29))
+    W[..., 5:9] /= 100.0
+    W[..., 17:21] /= 30.0
+    path = tmp_path / "residual.npz"
+    spread = np.zeros((len(Mode), 6))
+    storage.save(path, storage.Stored("residual", 0.005, W, spread, "clock_history"))
+    config = dataclasses.replace(
+        RunConfig(),
+        koopman=KoopmanConfig(
+            model="residual", file=str(path), feet="measured", dataset=DatasetConfig(dt=0.005)
+        ),
+        lmpc=LmpcConfig(model_dt=0.02, horizon=5),
+    )
+    own = build_controller(config)
+    params = build_params(config, go1.PARAMS)
+    observation = standing()
+    state = own.init(params, observation)
+    plan = jax.jit(own.plan)
+    before = []
+    for _ in range(3):
+        before.append(state)
+        state, info = plan(params, state, observation)
+        assert info.status == qp.Status.SOLVED
+    last = before[-1]
+    stance_time = config.gait.stance_time
+    view = build_base(config.sim.base).view(params.robot, None, observation)
+    feet = np.array(view.planar.feet - view.planar.x[:2]).reshape(2, 2, 2)
+    feet[..., 1] -= go1.FOOT_RADIUS
+    ends = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
+    family = prediction.build_family(config.koopman)
+    numbers, force, _ = jax.tree.map(lambda a: a[Mode.TROT], params.prediction)
+
+    def forces(u_before, elapsed):
+        start = families.Start(
+            view.planar.x, jnp.asarray(ends) @ view.planar.rotation, u_before,
+            jnp.pi * elapsed / stance_time, jnp.pi / stance_time,
+        )  # fmt: skip
+        model = families.operating_point(family, numbers, start, force, 4)
+        ahead = config.lmpc.model_dt * jnp.arange(1, 6)
+        reference = reference_trajectory(
+            position=state.position, velocity=state.velocity, height=params.height[0],
+            periodic=jnp.zeros((5, 4)), ahead=ahead,
+        )  # fmt: skip
+        z = family.lift(numbers, start)
+        memory = last.memory
+        solved = solve_lmpc(
+            params.tables, jnp.asarray(Mode.TROT), z, reference, memory, config.lmpc, model=model
+        )
+        return solved.plan[:4]
+
+    forces = jax.jit(forces)
+    planned = last.memory.plan[:4]
+    np.testing.assert_allclose(state.clock.elapsed, 0.01, atol=1e-6)
+    np.testing.assert_allclose(forces(planned, 0.01), state.memory.plan[:4], atol=1e-6)
+    assert np.abs(forces(jnp.zeros(4), 0.01) - state.memory.plan[:4]).max() > 1e-2
+    assert np.abs(forces(planned, 0.1) - state.memory.plan[:4]).max() > 1e-2

@@ -12,7 +12,7 @@ linearises it where the robot is (``operating_point``), which for a linear famil
     srb           [1, x]                   the rigid body itself, feet fixed in the body
     planted       [1, x]                   the same with feet that stay on the ground
     exact         [1, x]                   planted, forces in the frame of the start: bilinear
-    residual      [1, x]                   planted + W phi(x, u, phase)
+    residual      [1, x, (u-, waves)]      planted + W phi(x, u, u-, waves)
     learned       [1, x, MLP(x)]           A z + sum_i z_i B_i u      (``learned``)
 """
 
@@ -35,10 +35,28 @@ class Start(NamedTuple):
     Attributes:
       x: (6,) state [m, rad, m/s, rad/s].
       feet: (2, 2) contact points (front, rear) from the centre of mass, body frame [m].
+      u_before: (4,) force of the same legs in the step before; 0 if ``None`` [N].
+      turn: place in the stance, 0 at its beginning and pi at its end [rad].
+      turn_rate: its change [rad/s].
     """
 
     x: Float[Array, "6"]
     feet: Float[Array, "2 2"]
+    u_before: Float[Array, "4"] | None = None
+    turn: Float[Array, ""] | float = 0.0
+    turn_rate: Float[Array, ""] | float = 0.0
+
+
+class Past(NamedTuple):
+    """What a residual may remember besides the state.
+
+    Attributes:
+      u_before: (4,) force of the same legs in the step before [N].
+      waves: (4,) place in the stance, ``waves_of``.
+    """
+
+    u_before: Float[Array, "4"]
+    waves: Float[Array, "4"]
 
 
 class BodyModel(NamedTuple):
@@ -180,20 +198,58 @@ def exact(dt: float) -> Family:
     return Family("exact", dt, states_only().names, _lift_state, step)
 
 
-def residual(dt: float, features: Callable[[Start, Array, Array], Array]) -> Family:
+def residual(
+    dt: float,
+    features: Callable[[Start, Array, Array, Past], Array],
+    *,
+    remembers: bool = True,
+) -> Family:
     """``residual``: the planted body and what data adds to it; numbers: ``ResidualModel``.
+
+    The lifted state holds the force of the step before, a delay coordinate, and the place in the
+    stance as four waves. These turn at a constant rate, which is linear: so a drift that changes
+    along the stance, and a force that arrives late, stay in a model that is linearised only once.
 
     Args:
       dt: one step [s].
-      features: (start, x, u) -> phi (F,).
+      features: (start, x, u, past) -> phi (F,); see ``koopman.features``.
+      remembers: whether the features look at the past; else the lifted state is [1, x].
     """
+    plain = states_only().names
+    forces = tuple(f"last {name}" for name in ("F_x front", "F_z front", "F_x rear", "F_z rear"))
+    names = (*plain, *forces, "sin turn", "cos turn", "sin 2 turn", "cos 2 turn")
+    state, last = len(plain), len(plain) + len(forces)
+
+    def lift(_: Any, start: Start) -> Array:
+        one = _with_one(start.x)
+        if not remembers:
+            return one
+        before = jnp.zeros((4,), one.dtype) if start.u_before is None else start.u_before
+        return jnp.concatenate([one, before, waves_of(jnp.asarray(start.turn, one.dtype))])
 
     def step(numbers: ResidualModel, start: Start, z: Array, u: Array) -> Array:
         x = z[STATE_ROWS]
+        past = Past(z[state:last], z[last:]) if remembers else Past(jnp.zeros(4), jnp.zeros(4))
         nominal = _planted_step(numbers.nominal, start, x, u, dt)
-        return _with_one(nominal + numbers.W @ features(start, x, u))
+        moved = _with_one(nominal + numbers.W @ features(start, x, u, past))
+        if not remembers:
+            return moved
+        single = _turned(past.waves[:2], start.turn_rate * dt)
+        double = _turned(past.waves[2:], 2 * start.turn_rate * dt)
+        return jnp.concatenate([moved, u, single, double])
 
-    return Family("residual", dt, states_only().names, _lift_state, step)
+    return Family("residual", dt, names if remembers else plain, lift, step)
+
+
+def waves_of(turn: Float[Array, "*V"]) -> Float[Array, "4 *V"]:
+    """Sine and cosine of the place in the stance (0 to pi) and of its double."""
+    return jnp.stack([jnp.sin(turn), jnp.cos(turn), jnp.sin(2 * turn), jnp.cos(2 * turn)])
+
+
+def _turned(wave: Float[Array, "2"], angle: Array | float) -> Float[Array, "2"]:
+    """Sine and cosine, an angle later."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([wave[0] * c + wave[1] * s, wave[1] * c - wave[0] * s])
 
 
 def affine_features(start: Start, x: Array, u: Array) -> Float[Array, "17"]:

@@ -10,7 +10,7 @@ sees no later state, contact or foothold. Two ways into the future:
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax import srb
-from kjax.koopman.whole_body import Features, Moment, Transitions, affine, planted, read
+from kjax.koopman.families import Family, operating_point
+from kjax.koopman.features import Features, Moment, affine
+from kjax.koopman.models import rollout
+from kjax.koopman.whole_body import Transitions, planted, read, start_at
 from kjax.types import MODE_ALPHA, STATE_DIM, Mode
 
 
@@ -169,6 +172,50 @@ def _step(features: Features, dt: float) -> Callable[..., tuple[Array, Array]]:
         return planted(body, mode, ground, x, u, dt) + gain, ground
 
     return jax.jit(jax.vmap(step, in_axes=(None, None, None, *([0] * 7))))
+
+
+def predict_as_lmpc(
+    data: Windows,
+    family: Family,
+    numbers: Any,
+    force: Float[Array, "modes 4"],
+    *,
+    steps: int,
+    feet: Float[Array, "modes 2 2"] | None = None,
+) -> Float[np.ndarray, "V H_plus_1 6"]:
+    """Predicted states of any family as an LMPC uses it: linearised at the start, mode frozen.
+
+    Args:
+      data: windows.
+      family: of the model.
+      numbers: of every contact mode.
+      force: about which it is linearised, body frame [N].
+      steps: of the model in a control tick.
+      feet: nominal contact points of every mode; those seen at the start if ``None`` [m].
+    """
+
+    def one(x: Array, ground: Array, u: Array, mode: Array, moment: Moment) -> Array:
+        here = jax.tree.map(lambda a: a[mode], numbers)
+        start = start_at(x, ground)
+        rate = jnp.pi / (moment.elapsed + moment.left)
+        start = start._replace(
+            feet=start.feet if feet is None else feet[mode],
+            u_before=moment.u_before,
+            turn=rate * moment.elapsed,
+            turn_rate=rate,
+        )
+        model = operating_point(family, here, start, force[mode], steps)
+        return rollout(model, family.lift(here, start), u, start.feet)
+
+    run = jax.jit(jax.vmap(one))
+    states = np.repeat(data.x[:, :1], data.u.shape[1] + 1, axis=1)
+    for first in range(0, len(states), _BLOCK):
+        rows = np.arange(first, first + _BLOCK) % len(states)
+        moment = jax.tree.map(lambda a, rows=rows: jnp.asarray(a[rows, 0]), data.moment)
+        values = run(data.x[rows, 0], data.ground[rows], data.u[rows], data.mode[rows, 0], moment)
+        count = min(_BLOCK, len(states) - first)
+        states[first : first + count] = np.asarray(values)[:count]
+    return states
 
 
 def squared_errors(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax import srb
 from kjax.config import ConfigError, KoopmanConfig
-from kjax.koopman import families, storage
+from kjax.koopman import families, features, storage
 from kjax.koopman.dataset import ranges_from_config, sample
 from kjax.koopman.edmd import build_dictionary, fit_bilinear
 from kjax.koopman.families import BodyModel, Family, ResidualModel
@@ -55,7 +55,8 @@ def build_family(config: KoopmanConfig) -> Family:
         return families.exact(dt)
     stored = _stored(config)
     if config.model == "residual":
-        return families.residual(dt, families.affine_features)
+        own = features.BY_NAME[stored.features]
+        return families.residual(dt, own, remembers=stored.features != "affine")
     return learned(dt, stored.numbers.head.A.shape[-1] - len(states_only().names))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from kjax.config import ConfigError
 from kjax.koopman.families import BilinearModel
+from kjax.koopman.features import BY_NAME
 from kjax.koopman.learned import Layer, LearnedModel
 from kjax.types import Mode
 
@@ -19,12 +20,14 @@ class Stored(NamedTuple):
       dt: step of the model [s].
       numbers: W (M, 6, F) of a residual, or a ``LearnedModel``; a leading axis over ``Mode``.
       spread: (M, 6) standard deviation of the one-step error [m, rad, m/s, rad/s].
+      features: that the weights of a residual belong to, a name of ``features.BY_NAME``.
     """
 
     family: str
     dt: float
     numbers: Any
     spread: np.ndarray
+    features: str = "affine"
 
 
 def save(path: Path, stored: Stored) -> None:
@@ -35,7 +38,7 @@ def save(path: Path, stored: Stored) -> None:
         "spread": np.asarray(stored.spread),
     }
     if stored.family == "residual":
-        arrays["W"] = np.asarray(stored.numbers)
+        arrays |= {"W": np.asarray(stored.numbers), "features": np.array(stored.features)}
     elif stored.family == "learned":
         model: LearnedModel = stored.numbers
         for i, layer in enumerate(model.layers):
@@ -73,12 +76,18 @@ def load(path: Path, family: str) -> Stored:
                 centre=arrays["centre"],
                 scale=arrays["scale"],
             )
-        stored = Stored(family, float(arrays["dt"]), numbers, arrays["spread"])
+        own = str(arrays.get("features", "affine"))
+        stored = Stored(family, float(arrays["dt"]), numbers, arrays["spread"], own)
     except KeyError as error:
         raise ConfigError(f"koopman.file: '{path}' lacks {error}") from None
     for name, values in arrays.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise ConfigError(f"koopman.file: '{path}': {name} holds numbers that are not finite")
+    if own not in BY_NAME:
+        raise ConfigError(
+            f"koopman.file: '{path}' holds weights of features '{own}', wanted one of "
+            f"{', '.join(BY_NAME)}"
+        )
     if len(stored.spread) != len(Mode):
         raise ConfigError(
             f"koopman.file: '{path}' holds {len(stored.spread)} contact modes, wanted {len(Mode)}"

@@ -26,7 +26,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kjax import srb
 from kjax.koopman import regression
-from kjax.koopman.families import Start, affine_features
+from kjax.koopman.families import Start
+from kjax.koopman.features import Features, Moment, affine
 from kjax.types import MODE_ALPHA, STATE_DIM, Mode
 
 TOUCH = 5.0  # N, foot force above which a foot touches the ground
@@ -105,24 +106,6 @@ class Transitions(NamedTuple):
         return Transitions(*(field[which] for field in self))
 
 
-class Moment(NamedTuple):
-    """Where in the gait a step lies; of many steps with leading axes.
-
-    Attributes:
-      u_before: (4,) force of the same legs in the tick before [N].
-      elapsed: since the phase began [s].
-      left: until it ends, this step included [s].
-    """
-
-    u_before: Float[Array | np.ndarray, "*V 4"]
-    elapsed: Float[Array | np.ndarray, "*V"]
-    left: Float[Array | np.ndarray, "*V"]
-
-
-# (start, x, u, moment) -> phi (F,)
-Features = Callable[[Start, Array, Array, Moment], Float[Array, "F"]]
-
-
 class Fit(NamedTuple):
     """Weights of all contact modes, and how well they were determined.
 
@@ -187,55 +170,6 @@ def split(
     if len(drawn) <= out:
         raise ValueError(f"a share of {share} of {len(drawn)} episodes leaves none to fit on")
     return np.sort(drawn[out:]), np.sort(drawn[:out])
-
-
-def affine(start: Start, x: Array, u: Array, moment: Moment) -> Float[Array, "17"]:
-    """``families.affine_features``: all that the ``residual`` family of the LMPC takes."""
-    return affine_features(start, x, u)
-
-
-def clock(start: Start, x: Array, u: Array, moment: Moment) -> Float[Array, "25"]:
-    """Affine, and the place in the phase: waves over it, alone and times v_x.
-
-    The legs in the air swing as fast as the robot walks, and their inertia turns the body.
-    """
-    return jnp.concatenate([affine_features(start, x, u), _waves(x, moment)])
-
-
-def history(start: Start, x: Array, u: Array, moment: Moment) -> Float[Array, "21"]:
-    """Affine, and the force of the tick before: joints and contacts yield, so forces lag."""
-    return jnp.concatenate([affine_features(start, x, u), moment.u_before])
-
-
-def clock_history(start: Start, x: Array, u: Array, moment: Moment) -> Float[Array, "29"]:
-    """Affine, the place in the phase and the force before."""
-    return jnp.concatenate([affine_features(start, x, u), moment.u_before, _waves(x, moment)])
-
-
-def touchdown(dt: float, ticks: int = 3) -> Features:
-    """``clock_history`` and what feet do around a change: one level and slope for each tick of it.
-
-    Args:
-      dt: control tick [s].
-      ticks: before the end of a phase and after its beginning.
-    """
-
-    def features(start: Start, x: Array, u: Array, moment: Moment) -> Array:
-        count = jnp.arange(ticks)
-        after = jnp.round(moment.elapsed / dt) == count
-        before = jnp.round(moment.left / dt) == count + 1
-        near = jnp.concatenate([after, before]).astype(x.dtype)
-        slopes = (near[:, None] * jnp.stack([x[2], x[4], x[5]])).reshape(-1)
-        lost = (near[:ticks, None] * u).reshape(-1)  # a foot that is late carries nothing
-        return jnp.concatenate([clock_history(start, x, u, moment), near, slopes, lost])
-
-    return features
-
-
-def _waves(x: Array, moment: Moment) -> Float[Array, "8"]:
-    turn = jnp.pi * jnp.asarray(moment.elapsed / (moment.elapsed + moment.left))
-    waves = jnp.stack([jnp.sin(turn), jnp.cos(turn), jnp.sin(2 * turn), jnp.cos(2 * turn)])
-    return jnp.concatenate([waves, x[3] * waves])
 
 
 def start_at(x: Float[Array, "6"], ground: Float[Array, "2 2"]) -> Start:

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kjax import srb
-from kjax.koopman import edmd, families, observables, validate
+from kjax.koopman import edmd, families, features, observables, validate
 from kjax.koopman.dataset import SampleRanges, Snapshots, sample
 from kjax.koopman.models import input_map
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
@@ -140,7 +140,7 @@ def every_family(body):
         "planted": (families.planted(DT), known),
         "exact": (families.exact(DT), known),
         "residual": (
-            families.residual(DT, families.affine_features),
+            families.residual(DT, features.affine, remembers=False),
             families.ResidualModel(known, weights),
         ),
     }  # fmt: skip
@@ -202,7 +202,7 @@ def test_the_hovering_model_holds_the_lever_arms(body):
 def test_a_residual_adds_what_its_weights_say(body, start):
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
     known = families.BodyModel(body, alpha)
-    family = families.residual(DT, families.affine_features)
+    family = families.residual(DT, features.affine, remembers=False)
     u = jnp.asarray(forces(1)[0])
     z = family.lift(None, start)
     plain = families.planted(DT).step(known, start, z, u)

@@ -147,6 +147,16 @@ def test_a_file_that_is_not_there_or_no_file_at_all(tmp_path):
         KoopmanConfig(model="exact", file="a.npz")
 
 
+def test_weights_of_unknown_features_are_refused(tmp_path):
+    path = tmp_path / "residual.npz"
+    W, spread = np.zeros((len(Mode), 6, 21)), np.zeros((len(Mode), 6))
+    storage.save(path, storage.Stored("residual", 0.005, W, spread, "history"))
+    assert storage.load(path, "residual").features == "history"
+    storage.save(path, storage.Stored("residual", 0.005, W, spread, "mystery"))
+    with pytest.raises(ValueError, match="features 'mystery', wanted one of affine, history"):
+        storage.load(path, "residual")
+
+
 # ---------------------------------------------------------------- dictionaries
 
 X = np.array([0.1, 0.3, 0.2, 0.5, -0.4, 1.5])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.koopman import families, open_loop, storage, whole_body
+from kjax.koopman import families, features, open_loop, storage, whole_body
 from kjax.koopman.whole_body import Episode
 from kjax.types import MODE_ALPHA, Mode
 
@@ -30,7 +30,7 @@ def stepper(body, W):
     """Compiled (x, u, ground) -> next state."""
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
     numbers = families.ResidualModel(families.BodyModel(body, alpha), jnp.asarray(W[Mode.TROT]))
-    family = families.residual(DT, families.affine_features)
+    family = families.residual(DT, features.affine, remembers=False)
 
     def step(x, u, ground):
         start = whole_body.start_at(x, ground)
@@ -105,7 +105,7 @@ def test_the_fit_is_what_the_residual_family_takes(data, body, weights):
     assert len(window.x) == 10 * (4 * (PHASE - 5) - 3)
     predicted = open_loop.predict(window, body, dt=DT, W=weights)
     np.testing.assert_allclose(predicted, window.x, atol=1e-11)
-    family = families.residual(DT, families.affine_features)
+    family = families.residual(DT, features.affine, remembers=False)
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
     numbers = families.ResidualModel(
         families.BodyModel(body, alpha), jnp.asarray(weights[Mode.TROT])
@@ -113,6 +113,37 @@ def test_the_fit_is_what_the_residual_family_takes(data, body, weights):
     start = whole_body.start_at(jnp.asarray(window.x[3, 0]), jnp.asarray(window.ground[3]))
     states = families.rollout(family, numbers, start, jnp.asarray(window.u[3]))
     np.testing.assert_allclose(predicted[3], states, atol=1e-12)
+
+
+def test_a_residual_that_remembers_is_the_same_prediction(data, body):
+    """The LMPC's lifted state carries what the recording knows: the last force, turning waves."""
+    window = open_loop.windows(data, 6, inside=True, stride=7)
+    W = np.zeros((len(Mode), 6, 29))
+    W[Mode.TROT, 3:] = 1e-3 * np.random.default_rng(4).normal(size=(3, 29))
+    W[..., 5:9] /= 100.0
+    W[..., 17:21] /= 100.0
+    predicted = open_loop.predict(window, body, dt=DT, W=W, features=features.clock_history)
+    family = families.residual(DT, features.clock_history)
+    numbers = families.ResidualModel(
+        families.BodyModel(body, jnp.asarray(MODE_ALPHA[Mode.TROT], float)),
+        jnp.asarray(W[Mode.TROT]),
+    )
+
+    @jax.jit
+    def rollout(x, ground, moment, u):
+        whole = moment.elapsed[0] + moment.left[0]
+        start = whole_body.start_at(x, ground)._replace(
+            u_before=moment.u_before[0],
+            turn=jnp.pi * moment.elapsed[0] / whole,
+            turn_rate=jnp.pi / whole,
+        )
+        return families.rollout(family, numbers, start, u)
+
+    for i in (0, 1, 5):
+        moment = jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), window.moment)
+        own = rollout(window.x[i, 0], window.ground[i], moment, window.u[i])
+        np.testing.assert_allclose(own, predicted[i], atol=1e-12)
+        assert np.abs(predicted[i] - window.x[i]).max() > 1e-4  # the weights count
 
 
 def test_without_weights_the_prediction_is_the_planted_body(data, body):
@@ -184,7 +215,7 @@ def test_an_idle_end_gets_no_weight(body):
     )
     seen = whole_body.transitions([episode], dt=DT, sole=SOLE)
     assert not seen.u[:, 2:].any()
-    fit = whole_body.fit(seen, body, dt=DT, features=whole_body.history)
+    fit = whole_body.fit(seen, body, dt=DT, features=features.history)
     #  1, theta, v, omega; then force, arm, moments and last force of the front end
     assert fit.columns[Mode.FRONT] == fit.rank[Mode.FRONT] == 5 + 2 + 2 + 2 + 2
     idle = [7, 8, 11, 12, 15, 16, 19, 20]
@@ -275,7 +306,9 @@ def test_the_experiment_runs_and_records_once(repository, tmp_path):
     assert "recording" in first
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
-        "metrics.json", "details.json", "figure.png", "residual_trot.npz", "residual_bound.npz",
+        "metrics.json", "table.md", "details.json", "figure.png",
+        "residual_trot.npz", "residual_bound.npz",
+        "residual_trot_clock_history.npz", "residual_bound_clock_history.npz",
         "weights_trot.npz", "weights_bound.npz", "episodes_trot.npz", "episodes_bound.npz",
     }  # fmt: skip
     metrics = json.loads((tmp_path / "metrics.json").read_text())
