@@ -1,5 +1,6 @@
 """All numbers of a controller, and how they come from a config: fit, condense, gather."""
 
+import warnings
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -14,10 +15,11 @@ from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import fit_modes, srb_params
 from kjax.koopman.models import LinearModel
 from kjax.koopman.prediction import Prediction, build_prediction
+from kjax.koopman.validate import force_response_error
 from kjax.legs import lateral, swing
 from kjax.mpc import multiphase
 from kjax.mpc.lmpc import LmpcTables, build_tables, mode_settings
-from kjax.types import Command, Mode, RobotParams
+from kjax.types import MODE_ALPHA, Command, Mode, RobotParams
 
 
 class ControllerParams(NamedTuple):
@@ -68,7 +70,8 @@ class ControllerParams(NamedTuple):
 def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) -> ControllerParams:
     """Fit the Koopman models, condense the LMPC and gather everything that ``plan`` needs.
 
-    The work is done in float64 whatever the caller's default; the result is cast once.
+    The work is done in float64 whatever the caller's default; the result is cast once. A fit whose
+    response to forces is far from the rigid body's along the LMPC's horizon is warned of.
 
     Args:
       config: of the run.
@@ -77,7 +80,9 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
     """
     dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
     with jax.enable_x64(True):
-        params = jax.device_get(gather(config, robot, fit_models(config, robot)))
+        fits = fit_models(config, robot)
+        _warn_of_fits(config, fits)
+        params = jax.device_get(gather(config, robot, fits))
     return cast(params, dtype)
 
 
@@ -133,6 +138,39 @@ def _fit(
         prediction = build_prediction(body, koopman, key, height=height)
     spread = report.residual_rms if prediction is None else prediction.spread
     return jax.device_get(Fits(model, body.feet, spread, prediction))
+
+
+def _warn_of_fits(config: RunConfig, fits: Fits) -> None:
+    """Warn of a linear EDMD model that an LMPC over this horizon should not rely on."""
+    if config.koopman.model != "linear":
+        return
+    gaits = build_gaits(config)
+    planned = {
+        phase.mode
+        for one, nodes in zip(gaits, cycle_nodes(gaits, config), strict=True)
+        for phase in one.phases
+        if one.name in config.gait.names and not nodes.any()
+    }
+    body = jax.device_get(srb_params(config.srb)._replace(feet=fits.feet))
+    duration = config.lmpc.model_dt * config.lmpc.horizon
+    for mode in sorted(planned - {Mode.FLIGHT}):
+        model, here = (jax.tree.map(lambda a, m=mode: a[m], part) for part in (fits.model, body))
+        error = force_response_error(
+            model,
+            here,
+            MODE_ALPHA[mode],
+            steps=round(duration / config.koopman.dataset.dt),
+            duration=duration,
+        )
+        if error > 1.0:
+            warnings.warn(
+                f"koopman: over the LMPC's {duration:g} s the velocity that the fitted "
+                f"{mode.name.lower()} model predicts for a held force is {error:.1f} times the "
+                "rigid body's response away from it, so it may throw the robot over; try fewer "
+                "powers (koopman.order), more koopman.dataset.rollouts or another "
+                "koopman.dataset.seed",
+                stacklevel=3,
+            )
 
 
 def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParams:

@@ -610,3 +610,16 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
     np.testing.assert_allclose(forces(planned, 0.01), state.memory.plan[:4], atol=1e-6)
     assert np.abs(forces(jnp.zeros(4), 0.01) - state.memory.plan[:4]).max() > 1e-2
     assert np.abs(forces(planned, 0.1) - state.memory.plan[:4]).max() > 1e-2
+
+
+def test_a_fit_that_misjudges_forces_is_warned_of_and_a_good_one_is_not(recwarn):
+    """Seed 1's fourth powers of omega, contact points varied, answer forces 4.5 times wrong."""
+    lmpc = LmpcConfig(model_dt=0.02, horizon=10)
+    config = dataclasses.replace(
+        RunConfig(), lmpc=lmpc, koopman=KoopmanConfig(feet="measured", order=2)
+    )
+    build_params(config, go1.PARAMS)
+    assert not [w for w in recwarn if "koopman" in str(w.message)]
+    faulty = dataclasses.replace(config, koopman=KoopmanConfig(feet="measured"))
+    with pytest.warns(UserWarning, match=r"trot model predicts for a held force is 4\.5 times"):
+        build_params(faulty, go1.PARAMS)

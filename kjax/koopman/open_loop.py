@@ -197,11 +197,12 @@ def predict_as_lmpc(
     def one(x: Array, ground: Array, u: Array, mode: Array, moment: Moment) -> Array:
         here = jax.tree.map(lambda a: a[mode], numbers)
         start = start_at(x, ground)
-        rate = jnp.pi / (moment.elapsed + moment.left)
+        u_before, elapsed, left = (jnp.asarray(a) for a in moment)
+        rate = jnp.pi / (elapsed + left)
         start = start._replace(
             feet=start.feet if feet is None else feet[mode],
-            u_before=moment.u_before,
-            turn=rate * moment.elapsed,
+            u_before=u_before,
+            turn=rate * elapsed,
             turn_rate=rate,
         )
         model = operating_point(family, here, start, force[mode], steps)

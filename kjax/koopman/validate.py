@@ -6,13 +6,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from kjax import srb
 from kjax.koopman import families
 from kjax.koopman.dataset import SampleRanges, sample
 from kjax.koopman.models import LinearModel, rollout
-from kjax.koopman.observables import Dictionary
+from kjax.koopman.observables import STATE_ROWS, Dictionary
+from kjax.types import GRAVITY
 
 
 class ErrorStatistics(NamedTuple):
@@ -85,6 +87,49 @@ def summarise(errors: Float[Array, "states profiles steps 6"]) -> ErrorStatistic
         std=flat.std(axis=0),
         max=jnp.abs(flat).max(axis=0),
     )
+
+
+def force_response_error(
+    model: LinearModel,
+    body: srb.SrbParams,
+    alpha: Int[np.ndarray, "2"],
+    *,
+    steps: int,
+    duration: float,
+) -> float:
+    """How wrong a linear model's answer of the velocity to a held force is, at the horizon's end.
+
+    Powers of omega are observables that a linear fit closes badly. Where their coefficients are
+    large the velocity follows from differences of large numbers, which forces upset: prediction of
+    a swinging body may still look right while an LMPC on the model throws the robot over.
+
+    Args:
+      model: of one contact mode, over one step.
+      body: of that mode, with the contact points to judge at.
+      alpha: (2,) stance legs at front and rear.
+      steps: of the horizon.
+      duration: of it [s].
+
+    Returns:
+      Largest error of d v / d u against the level, hovering rigid body (its tilt under gravity
+      included), over the largest entry of the body's own response in that row [-].
+    """
+    held = jax.tree.map(lambda a: np.asarray(a, np.float64), model)
+    B = held.B + np.tensordot(np.asarray(body.feet, np.float64).reshape(4), held.B_feet, axes=1)
+    power, total = np.eye(len(B)), np.zeros_like(B)
+    for _ in range(steps):
+        total += power @ B
+        power = held.A @ power
+    mass, inertia = float(body.mass), float(body.inertia)
+    wanted = np.zeros((2, 4))
+    for end, legs in enumerate(np.asarray(alpha)):
+        x, z = np.asarray(body.feet, np.float64)[end]
+        wanted[0, 2 * end] = wanted[1, 2 * end + 1] = legs * duration / mass
+        # A moment turns the body and with it the vertical force that carries the weight.
+        turn = legs * np.array([-z, x]) / inertia
+        wanted[0, 2 * end : 2 * end + 2] -= GRAVITY * turn * duration**3 / 6
+    scale = np.abs(wanted).max(axis=1, keepdims=True)
+    return float((np.abs(total[STATE_ROWS][3:5] - wanted) / scale).max())
 
 
 # ---------------------------------------------------------------- any family, any plant

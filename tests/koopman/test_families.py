@@ -1,5 +1,7 @@
 """Every family of models against closed forms, finite differences and plain integration."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -229,3 +231,15 @@ def test_bootstrap_covers_the_mean_of_a_known_distribution():
 def test_bootstrap_needs_episodes():
     with pytest.raises(ValueError, match="at least 2 episodes, got 1"):
         validate.bootstrap(jax.random.key(0), jnp.zeros((1, 3)), jnp.mean)
+
+
+def test_the_response_to_forces_of_the_linearised_body_is_its_own(body):
+    """0.1 s ahead; and a wrong entry of B is reported as what it is."""
+    alpha = MODE_ALPHA[Mode.TROT]
+    model = families.linearised_srb(body, jnp.asarray(alpha, float), 0.27, DT)
+    judge = partial(validate.force_response_error, body=body, alpha=alpha, steps=100, duration=0.1)
+    assert judge(model) < 0.02  # the step of 1 ms against the closed form
+    wrong = model._replace(B=model.B.at[4, 0].add(0.5 * DT / body.mass))
+    pushed = 0.1 / body.mass
+    own = pushed + GRAVITY * body.feet[:, 1] / body.inertia * 0.1**3 / 6  # tilting under gravity
+    np.testing.assert_allclose(judge(wrong), 0.5 * pushed / own.max(), rtol=0.03)
