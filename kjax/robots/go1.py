@@ -27,6 +27,10 @@ _LEFT = np.array([-1.0, 1.0, -1.0, 1.0])
 
 _TRUNK_MASS = 5.204  # kg
 _LINK_MASS = np.array([0.68, 1.009, 0.195862])  # kg: hip, thigh, calf
+LINK_INERTIA = (
+    0.004689,
+    0.001498,
+)  # kg m^2: thigh and calf about their centres of mass, pitch axis
 
 
 def _link_com() -> np.ndarray:

@@ -18,9 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from kjax import gait
 from kjax.config import NoiseConfig, RunConfig
 from kjax.controller import ControllerState, build_controller, next_clock
 from kjax.legs import swing
+from kjax.legs.kinematics import PlanarState
 from kjax.params import ControllerParams
 from kjax.robots import go1
 from kjax.tuning import plant as body_plant
@@ -84,6 +86,7 @@ class _Carry(NamedTuple):
     feet: Array
     state: ControllerState
     force: Array  # at the end of the last tick, before what joints and ground keep back
+    spin: Array  # angular momentum of the legs
     alive: Array
 
 
@@ -135,6 +138,10 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             always = jnp.ones((), bool)
             state, info = controller.plan_from(params, state, seen, state.stance, always)
             true = body_plant.view(robot, plant.com, x, feet).planar
+            feet, rates, state = _swing(params, state, true, feet, dt)
+            spin = body_plant.leg_momentum(robot, plant, true, feet, rates)
+            # What the legs gain the trunk loses; at the first tick they are as they are.
+            x = x.at[5].add(jnp.where(number > 0, carry.spin - spin, 0.0) / plant.inertia)
             before = carry.force * state.stance[:, None]
             pressed, reached = body_plant.follow(plant, before, state.force, dt)
             force = body_plant.feasible(robot, plant, true, pressed)
@@ -153,7 +160,7 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
                 alive=carry.alive,
             )
             now = fade(jnp.where(alive, moved, x))
-            return _Carry(now, feet, state, reached, alive), record
+            return _Carry(now, feet, state, reached, spin, alive), record
 
         def stretch(carry: _Carry, numbers: Array) -> tuple[_Carry, Trace]:
             return jax.lax.scan(tick, carry, numbers)
@@ -161,7 +168,8 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
         numbers = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
         feet = _standing(params, plant, scenario.x)
         state = controller.init_from(params, body_plant.view(robot, plant.com, scenario.x, feet))
-        first = _Carry(scenario.x, feet, state, jnp.zeros_like(feet), jnp.ones((), bool))
+        none = jnp.zeros_like(feet)
+        first = _Carry(scenario.x, feet, state, none, none[0, 0], jnp.ones((), bool))
         _, trace = jax.lax.scan(jax.checkpoint(stretch), first, numbers)
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], trace)
 
@@ -203,6 +211,29 @@ def _touch_down(
     )
     place = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
     return jnp.where(landing[:, None], place, carry.feet)
+
+
+def _swing(
+    params: ControllerParams, state: ControllerState, body: PlanarState, feet: Array, dt: float
+) -> tuple[Array, Array, ControllerState]:
+    """Feet (4, 2) and their velocities, those in the air on their way; the controller's ``act``."""
+    robot, clock = params.robot, state.clock
+    settings = swing.for_gait(params.swing, clock.gait)
+    along = swing.foothold(
+        robot,
+        settings,
+        body,
+        gait.time_to_touchdown(params.schedule, clock),
+        params.schedule.stance_time[clock.gait, clock.phase],
+        state.velocity + state.correction[0],
+    )
+    target = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
+    place, rate = swing.foot_reference(settings, state.swing, target)
+    standing = state.stance[:, None]
+    never = jnp.zeros((4,), bool)
+    swings = swing.continue_swings(settings, state.swing, ~state.stance, never, feet, dt)
+    moved = jnp.where(standing, feet, place)
+    return moved, jnp.where(standing, 0.0, rate), state._replace(swing=swings)
 
 
 class CostWeights(NamedTuple):
@@ -259,6 +290,7 @@ def draw_scenarios(
     mass_error: float = 0.1,
     inertia_error: float = 0.2,
     lag: float = 0.005,
+    gain: tuple[float, float] = (0.85, 1.0),
     robot: RobotParams = go1.PARAMS,
 ) -> Scenario:
     """Random scenarios (count, ...): commands, starts, masses, inertias, noise.
@@ -272,12 +304,13 @@ def draw_scenarios(
       mass_error: largest relative error of the mass [-].
       inertia_error: largest relative error of the inertia [-].
       lag: longest lag of the forces [s].
+      gain: range of the part of a planned force that arrives [-].
       robot: whose plant it is.
     """
     rng = np.random.default_rng(seed)
     noise = config.noise if config.noise.enabled else _silent()
-    gait = config.gait.names[0]
-    height = config.bound.height if gait == "bound" else config.lmpc.height
+    bounds = config.gait.names[0] == "bound"
+    height = config.bound.height if bounds else config.lmpc.height
     times = np.arange(pieces) * config.duration / pieces
     nominal = body_plant.nominal_plant(
         robot, config.srb.mass, config.srb.inertia, config.sim.friction
@@ -297,6 +330,9 @@ def draw_scenarios(
         com=jnp.broadcast_to(nominal.com, (count, 2)),
         friction=jnp.broadcast_to(nominal.friction, (count,)),
         lag=rng.uniform(0.0, lag, count),  # type: ignore[arg-type]
+        gain=rng.uniform(*gain, count),  # type: ignore[arg-type]
+        link_inertia=jnp.broadcast_to(nominal.link_inertia, (count, 2)),
+        spin=jnp.broadcast_to(nominal.spin, (count,)),
     )
     drawn = Scenario(
         command=Command(

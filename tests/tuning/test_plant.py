@@ -1,11 +1,15 @@
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from kjax.config import SimConfig
+from kjax.legs.kinematics import foot_jacobian, foot_position, leg_trig
 from kjax.legs.stance import stance_torque
 from kjax.robots import go1
+from kjax.sim import scene
 from kjax.tuning import plant
 
 PLANT = plant.nominal_plant(go1.PARAMS, 12.7, 0.39)
@@ -50,6 +54,40 @@ def test_forces_that_joints_and_ground_can_give_pass_unchanged():
     body = plant.view(go1.PARAMS, PLANT.com, X, FEET).planar
     force = jnp.tile(jnp.array([3.0, 30.0]), (4, 1))
     np.testing.assert_allclose(plant.feasible(go1.PARAMS, PLANT, body, force), force, rtol=1e-12)
+
+
+def test_the_legs_angular_momentum_is_mujocos():
+    """Planar Go1, trunk at rest or moving, legs swinging: MuJoCo's less the trunk's own share."""
+    model = scene.build_model(SimConfig())
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    for trial in range(5):
+        joints = np.tile([0.0, 0.9, -1.8], (4, 1)) + [0, 1, 1] * rng.uniform(-0.4, 0.4, (4, 3))
+        rates = rng.normal(size=(4, 3)) * [0.0, 6.0, 8.0]
+        data.qpos[-12:], data.qvel[:] = joints.reshape(-1), 0.0
+        data.qvel[-12:] = rates.reshape(-1)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        wanted = -data.subtree_angmom[0][1]  # nose down in MuJoCo
+        trig = leg_trig(jnp.asarray(joints))
+        base = data.body("trunk").xpos[::2]
+        com = jnp.asarray(data.subtree_com[0][::2] - base)
+        feet = foot_position(go1.PARAMS, trig) + go1.PARAMS.hip_pos[:, ::2]
+        x = jnp.array([*(com + base), 0.0, *rng.normal(size=2), 0.0])
+        here = PLANT._replace(com=com)
+        body = plant.view(go1.PARAMS, com, x, feet + base).planar
+        J = foot_jacobian(go1.PARAMS, trig)
+        velocity = jnp.einsum("nij,nj->ni", J, jnp.asarray(rates[:, 1:])) + x[3:5]
+        got = plant.leg_momentum(go1.PARAMS, here, body, feet + base, velocity)
+        assert abs(wanted) > 0.05, trial
+        np.testing.assert_allclose(got, wanted, rtol=1e-3)  # inertias to four digits
+
+
+def test_a_part_of_a_force_may_be_lost():
+    body = plant.view(go1.PARAMS, PLANT.com, X, FEET).planar
+    force = jnp.tile(jnp.array([3.0, 30.0]), (4, 1))
+    weak = PLANT._replace(gain=jnp.asarray(0.9))
+    np.testing.assert_allclose(plant.feasible(go1.PARAMS, weak, body, force), 0.9 * force)
 
 
 @pytest.mark.parametrize(
