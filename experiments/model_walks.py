@@ -34,8 +34,15 @@ def main() -> None:
     parser.add_argument("--residual", type=Path, metavar="DIR", help="results of whole_body.py: "
                         "walk with its residuals as well")  # fmt: skip
     parser.add_argument("--gaits", nargs="+", choices=GAITS, default=list(GAITS))
+    parser.add_argument("--draw", action="store_true", help="draw finished walks again")
     args = parser.parse_args()
     folder = cli.output_folder(args, "model_walks")
+    if args.draw:
+        file = folder / "metrics.json"
+        if not file.exists():
+            cli.fail(f"--draw: no metrics.json in {folder}")
+        walks = json.loads(file.read_text(encoding="utf-8"))["walks"]
+        return figure(walks, folder / "figure.png")
     cli.configure_jax()
     path, clock = folder / "walks.json", time.perf_counter()
     there = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -183,36 +190,51 @@ def _interval(entry: dict[str, Any], name: str) -> str:
 
 
 def figure(walks: dict[str, Any], path: Path) -> None:
-    """Error of the speed for each model, tuned and with the config's own weights."""
+    """Error of the speed and pitch of each model, tuned and with the config's own weights."""
     gaits = list(dict.fromkeys(entry["gait"] for entry in walks.values()))
+    panels = (("rmse", "rmse of v_x [m/s]"), ("pitch", "pitch, 95 % [deg]"))
     fig, axes = plt.subplots(
-        1, len(gaits), figsize=(1.5 + 4.5 * len(gaits), 3.6), layout="constrained", squeeze=False
-    )
-    for ax, gait in zip(axes[0], gaits, strict=True):
+        len(gaits), 2, figsize=(9.5, 0.8 + 3.4 * len(gaits)), sharey="row", layout="constrained",
+        squeeze=False,
+    )  # fmt: skip
+    for row, gait in zip(axes, gaits, strict=True):
         own = [entry for entry in walks.values() if entry["gait"] == gait]
-        for shift, key, label in (
-            (-0.12, "own_weights", "config's weights"),
-            (0.12, "tuned", "tuned"),
-        ):
-            value, low, high = (
-                np.array([e[key][f"rmse_{part}"] for e in own], float)
-                for part in ("median", "low", "high")
-            )
-            at = np.arange(len(own)) + shift
-            ax.errorbar(value, at, xerr=[value - low, high - value], fmt="o", ms=4, label=label)
-            for y, entry in zip(at, own, strict=True):
-                if entry[key]["falls"]:
-                    count = f"{entry[key]['falls']} of {entry[key]['episodes']} fell"
-                    ax.annotate(count, (1.0, y), xycoords=("axes fraction", "data"),
-                                ha="right", va="center", fontsize=7)  # fmt: skip
-        ax.set_yticks(range(len(own)), [entry["model"] for entry in own])
-        ax.invert_yaxis()
-        ax.set(xlabel="rmse of v_x [m/s]", title=gait)
-        ax.set_xlim(left=0.0)
-        ax.grid(axis="x", alpha=0.3)
-    axes[0][0].legend(fontsize=8)
+        for ax, (name, label) in zip(row, panels, strict=True):
+            seen = []
+            for shift, key, legend in (
+                (-0.12, "own_weights", "config's weights"),
+                (0.12, "tuned", "tuned"),
+            ):
+                value, low, high = (
+                    np.array([e[key][f"{name}_{part}"] for e in own], float)
+                    for part in ("median", "low", "high")
+                )
+                # Medians of a few that stayed up would press all others together.
+                walked = np.array([2 * e[key]["falls"] < e[key]["episodes"] for e in own])
+                value[~walked] = np.nan
+                seen.append(value)
+                at = np.arange(len(own)) + shift
+                ax.errorbar(value, at, xerr=[value - low, high - value], fmt="o", ms=4,
+                            label=legend)  # fmt: skip
+            low, high = np.nanmin(seen), np.nanmax(seen)
+            ax.set_xlim(low - 0.15 * (high - low), high + 0.15 * (high - low))
+            ax.set(xlabel=label, title=gait)
+            ax.grid(axis="x", alpha=0.3)
+        row[0].set_yticks(range(len(own)), [entry["model"] + _falls(entry) for entry in own],
+                          fontsize=8)  # fmt: skip
+        row[0].invert_yaxis()
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8)
     fig.savefig(path, dpi=120)
     plt.close(fig)
+
+
+def _falls(entry: dict[str, Any]) -> str:
+    """Falls with the config's weights and tuned, where there are any."""
+    own, tuned = entry["own_weights"], entry["tuned"]
+    if not own["falls"] + tuned["falls"]:
+        return ""
+    return f"\n{own['falls']} of {own['episodes']}, {tuned['falls']} of {tuned['episodes']} fell"
 
 
 if __name__ == "__main__":
