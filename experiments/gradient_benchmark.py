@@ -20,6 +20,8 @@ _FILES = {
     "trot, planted model, measured feet": "trot_velocity_long",
     "trot to bound": "bound_velocity_short",
     "bound, the paper's timing": "bound_velocity",
+    "bound, friction as rows": "bound_velocity_short",
+    "bound, horizon through flight": "bound_multiphase",
 }
 CASES: dict[str, dict[str, Any]] = {name: {} for name in _FILES} | {
     "trot, planted model, measured feet": {
@@ -27,10 +29,13 @@ CASES: dict[str, dict[str, Any]] = {name: {} for name in _FILES} | {
         "lmpc.command_slew": 1.0,
     },
     "trot to bound": {"gait.names": ["trot", "bound"], "gait.times": [0.0, 0.45]},
+    "bound, friction as rows": {"lmpc.friction": 0.6},
 }  # fmt: skip
 LMPC = ("lmpc.state_weights", "lmpc.input_weight", "lmpc.force_x_max", "lmpc.height")
 BOUND = ("bound.state_weights", "bound.input_weight", "bound.feet_front", "bound.force_edge",
          "bound.force_z_max", "bound.velocity_gain")  # fmt: skip
+CYCLE = ("multiphase.state_weights", "multiphase.input_weight", "multiphase.inertia_scale",
+         "multiphase.velocity_time", "bound.feet_front", "bound.velocity_gain")  # fmt: skip
 KEYS = {
     "trot": (*LMPC, "leg.velocity_gain"),
     "trot, planted model, measured feet": (
@@ -38,6 +43,8 @@ KEYS = {
     ),
     "trot to bound": (*LMPC, *BOUND),
     "bound, the paper's timing": BOUND,
+    "bound, friction as rows": BOUND,
+    "bound, horizon through flight": CYCLE,
 }  # fmt: skip
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 CHECKED = 6  # scenarios with differences
@@ -52,7 +59,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     count = 16 if args.quick else MANY
     result: dict[str, Any] = {"seconds": SECONDS, "scenarios": count, "cases": {}}
     errors: dict[str, np.ndarray] = {}
-    for name in list(CASES)[:1] if args.quick else CASES:
+    for name in list(_FILES)[:1] if args.quick else _FILES:
         config, space = prepared(name)
         entry, errors[name] = checked(config, space, 2 if args.quick else CHECKED, count)
         entry |= priced(config, space, count, 2 if args.quick else ROUNDS)

@@ -94,8 +94,8 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "--rate",
         type=float,
-        default=1e-5,
-        help="of Adam; the least-squares head is lost above 1e-4",
+        default=3e-3,
+        help="of Adam, in what each number moves by itself",
     )
     parser.add_argument("--scenarios", type=int, default=4, help="closed loops per update")
     parser.add_argument("--seconds", type=float, default=0.6, help="length of each")
