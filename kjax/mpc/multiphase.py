@@ -184,7 +184,8 @@ def predict(
       cycle_time: length of the gait cycle [s].
     """
     missing = command - velocity
-    ramp = jnp.maximum(jnp.abs(missing) / slew, jnp.finfo(slew.dtype).tiny)  # s, until it is there
+    # s, until it is there; no shorter than what leaves derivatives by it finite.
+    ramp = jnp.maximum(jnp.abs(missing) / slew, 1e-6)
 
     def speed(t: Array) -> Array:
         return velocity + missing * jnp.minimum(t / ramp, 1.0)

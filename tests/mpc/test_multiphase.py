@@ -279,3 +279,28 @@ def test_only_a_bound_with_that_horizon_has_nodes(config):
     assert nodes.sum() == nodes[BOUND].sum()
     assert cycle_nodes(gaits, RunConfig()).sum() == 0
     assert [phase.mode for phase in gaits[BOUND].phases][1] == Mode.FLIGHT
+
+
+@pytest.mark.parametrize("slew", [2.0, np.inf])
+def test_an_outlook_has_derivatives_where_the_reference_has_arrived(
+    params, schedule, outlook_of, slew
+):
+    """Reverse mode by velocity and command, against differences; at the kink from one side."""
+    nodes = nodes_at(params, schedule, FRONT, 0.03)
+    x = jnp.array([0.1, 0.27, 0.02, 0.35, -0.1, 0.4])
+
+    @jax.jit
+    def total(velocity, command):
+        out = outlook_of(nodes, x, velocity, command, slew)
+        return jnp.sum(out.path) + 0.3 * jnp.sum(out.reference) + 0.7 * jnp.sum(out.foot)
+
+    both = jax.jit(jax.grad(total, argnums=(0, 1)))
+    assert np.isfinite(both(0.3, 0.3)).all()
+    for velocity, command in ((0.3, 0.3001), (0.3, 0.9)):
+        slopes = both(velocity, command)
+        h = 1e-6
+        wanted = (
+            (total(velocity + h, command) - total(velocity - h, command)) / (2 * h),
+            (total(velocity, command + h) - total(velocity, command - h)) / (2 * h),
+        )
+        np.testing.assert_allclose(slopes, wanted, rtol=1e-6, atol=1e-7)
