@@ -30,10 +30,10 @@ envelope: setup  ## limits of each gait by bisection over seeds; goes on where i
 	$(BIN)/python experiments/envelope.py
 
 test: setup  ## everything
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 test-fast: setup  ## without the slow tests
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 check: setup  ## what to run before a commit
 	$(BIN)/ruff format --check .

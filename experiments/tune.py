@@ -31,7 +31,7 @@ from kjax.sim.batch_loop import BatchEngine
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
-from kjax.tuning.optimise import build_objective, descend
+from kjax.tuning.optimise import build_objective, check_checkpoint, descend
 from kjax.tuning.space import KINDS, Space, Variables, build_space, tuned_config
 
 KEYS = {
@@ -64,6 +64,11 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
         cli.fail(f"--{error}" if str(error).startswith("keys") else str(error))
     begin = worsened(space, args.worsen, args.worsen_seed)
     identity = config_hash(short) + json.dumps([code_version(), *_settings(args)])
+    checkpoint = folder / "checkpoint.npz"
+    try:
+        check_checkpoint(checkpoint, identity)
+    except ValueError as error:
+        cli.fail(str(error))
     train, held_out = (
         loop.draw_scenarios(short, seed, count, speeds=args.speeds, pieces=args.pieces)
         for seed, count in ((TRAIN_SEED, args.scenarios), (HELD_OUT_SEED, args.held_out))
@@ -83,7 +88,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
             result = descend(
                 objective, space, train, held_out, start=begin, updates=args.updates,
                 rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
-                checkpoint=folder / "checkpoint.npz", identity=identity, on_update=show,
+                checkpoint=checkpoint, identity=identity, on_update=show,
             )  # fmt: skip
         except ValueError as error:
             cli.fail(str(error))

@@ -6,6 +6,8 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("NPROC", "1")  # see kjax.cli.configure_jax
+# Compiling is most of the time; LLVM's optimisations cost a third of it and change no result.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import chex
 import jax
@@ -39,6 +41,20 @@ from kjax.robots import go1
 from kjax.types import MODE_ALPHA, Leg
 
 DT = 1e-3  # s, step of the shared snapshots
+
+
+# The files that take longest, first: a worker that gets one last would leave the other idle.
+LONGEST = (
+    "test_mjx", "test_notebooks", "test_tune", "test_whole_body", "test_free_base",
+    "test_sensitivity", "test_runner", "test_loop", "test_excitation", "test_closed_loop",
+    "test_reproduce", "test_solvers", "test_rows",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    """The longest files first; within a file, and between the others, the order stays."""
+    place = {name: index for index, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 @pytest.fixture(autouse=True)

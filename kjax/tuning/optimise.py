@@ -243,7 +243,17 @@ def _save(path: Path, identity: str, run: _Run) -> None:
     scratch.replace(path)
 
 
-def _load(path: Path, identity: str, fresh: _Run) -> _Run:
+def check_checkpoint(path: Path, identity: str) -> None:
+    """See that ``descend`` can go on from a checkpoint, if there is one.
+
+    Raises:
+      ValueError: for one of another tuning, or what is none.
+    """
+    if path.exists():
+        _read(path, identity)
+
+
+def _read(path: Path, identity: str) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -255,6 +265,11 @@ def _load(path: Path, identity: str, fresh: _Run) -> _Run:
             f"checkpoint: '{path}' is of another tuning (other config, options or code); take "
             "another folder, or remove it"
         )
+    return arrays, plain
+
+
+def _load(path: Path, identity: str, fresh: _Run) -> _Run:
+    arrays, plain = _read(path, identity)
     leaves, tree = jax.tree.flatten(fresh.arrays)
     values = [jnp.asarray(arrays[f"leaf_{i}"]) for i in range(len(leaves))]
     fresh.variables, fresh.state, fresh.best = jax.tree.unflatten(tree, values)
