@@ -6,7 +6,9 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("NPROC", "1")  # see kjax.cli.configure_jax
-# Compiling is most of the time; LLVM's optimisations cost a third of it and change no result.
+# Compiling is most of the time, and LLVM's optimisations cost a third of it. Scripts that tests
+# start run for longer, and get what users get.
+given = os.environ.get("XLA_FLAGS")
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import chex
@@ -23,6 +25,10 @@ jax.config.update("jax_cpu_enable_async_dispatch", False)
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".cache" / "jax"))
 # Most of the time goes into hundreds of small programs, so that all of them are kept.
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+jax.block_until_ready(jax.jit(lambda x: x + 1)(0.0))  # XLA has read its flags now
+if given is None:
+    del os.environ["XLA_FLAGS"]
 
 # Shapes and dtypes of annotated arguments are checked in tests only, so before kjax is imported.
 CHECKED = (

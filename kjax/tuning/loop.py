@@ -141,7 +141,8 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             feet, rates, state = _swing(params, state, true, feet, dt)
             spin = body_plant.leg_momentum(robot, plant, true, feet, rates)
             # What the legs gain the trunk loses; at the first tick they are as they are.
-            x = x.at[5].add(jnp.where(number > 0, carry.spin - spin, 0.0) / plant.inertia)
+            turns = (number > 0) & carry.alive
+            x = x.at[5].add(jnp.where(turns, carry.spin - spin, 0.0) / plant.inertia)
             before = carry.force * state.stance[:, None]
             pressed, reached = body_plant.follow(plant, before, state.force, dt)
             force = body_plant.feasible(robot, plant, true, pressed)
