@@ -141,7 +141,8 @@ def _build_stance_planner(config: RunConfig) -> Planner:
                 friction=lmpc.friction,
                 torque_fraction=lmpc.torque_fraction,
             )
-        rate = jnp.pi / gait.phase_duration(params.schedule, clock)
+        duration = gait.phase_duration(params.schedule, clock)
+        rate = jnp.pi / jnp.maximum(duration, lmpc.control_dt)
         # Legs that have just come down pressed nothing before.
         fresh = clock.elapsed < 0.5 * lmpc.control_dt
         last = jnp.where(fresh, 0.0, task.memory.plan[:4])
