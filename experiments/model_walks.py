@@ -55,7 +55,11 @@ def main() -> None:
             label = f"{gait}, {name}" + (", quick" if args.quick else "")
             if label in walks:
                 continue
-            walks[label] = {"gait": gait, "model": name, **walk(gait, keys, args.quick)}
+            try:
+                walks[label] = {"gait": gait, "model": name, **walk(gait, keys, args.quick)}
+            except KeyboardInterrupt:
+                print(f"interrupted; finished models are kept in {folder}/, run again to go on")
+                raise SystemExit(130) from None
             cli.save_json(path, {"code": code_version(), "walks": walks})
             tuned = walks[label]["tuned"]
             print(f"{label}: rmse {tuned['rmse_median']:.4f} m/s, {tuned['falls']} of "
