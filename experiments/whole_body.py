@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import whole_body_report as report
 from prediction_models import MODELS as MODEL_KEYS
 from prediction_models import residual
 
@@ -71,12 +72,6 @@ MODELS: dict[str, Features] = {
     "touchdown": touchdown(DT),
 }
 KEPT = ("affine", "clock_history")  # for koopman.file
-LABELS = {
-    "nominal": "rigid body, feet planted",
-    "affine": "+ affine residual",
-    "clock_history": "+ place in the phase, last force",
-    "touchdown": "+ ticks around a touchdown",
-}
 
 
 def main() -> None:
@@ -130,35 +125,15 @@ def main() -> None:
         "robots_per_kind": args.robots,
         "duration_s": args.duration,
         "force_noise_n": args.force,
-        **{gait: compact(entry) for gait, entry in metrics.items()},
+        **{gait: report.compact(entry) for gait, entry in metrics.items()},
         "families": families,
         "provenance": cli.provenance(),
     }
-    (folder / "table.md").write_text(table(families), encoding="utf-8")
+    (folder / "table.md").write_text(report.table(families), encoding="utf-8")
     cli.save_json(folder / "metrics.json", result)
     cli.save_json(folder / "details.json", metrics)
-    save_figure(curves, folder / "figure.png")
-    print(f"\n{table(families)}\nresults in {folder}/")
-
-
-def compact(entry: dict[str, Any]) -> dict[str, Any]:
-    """Ratios with their intervals, rms of the nominals: [velocity, pitch rate] for each model."""
-    out: dict[str, Any] = {}
-    for where in ("inside", "all_starts"):
-        for name, horizons in entry[where].items():
-            for horizon, groups in horizons.items():
-                for group, errors in groups.items():
-                    if not isinstance(errors, dict):
-                        continue
-                    place = out.setdefault(f"{where}, {horizon}, {group}", {})
-                    both = [errors["velocity"], errors["omega"]]
-                    if name.endswith("nominal"):
-                        place[f"{name}, rms"] = [round(float(e["rms"]), 5) for e in both]
-                    else:
-                        place[name] = [
-                            [round(float(v), 4) for v in (e["ratio"], *e["interval"])] for e in both
-                        ]
-    return out
+    report.save_figure(curves, DT, folder / "figure.png")
+    print(f"\n{report.table(families)}\nresults in {folder}/")
 
 
 def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[RunConfig]:
@@ -252,15 +227,15 @@ def study(
             subset[len(subset)] = "rough" if kind.endswith("rough") else flat
             episodes.append(episode)
     numbers = np.arange(len(episodes))
-    rest, report = whole_body.split(numbers, share=HELD_OUT)
+    rest, told = whole_body.split(numbers, share=HELD_OUT)
     train, tune = whole_body.split(rest, share=TUNE, seed=1)
     data = whole_body.transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
-    fitted, tuned, held = (data.rows(np.isin(data.episode, own)) for own in (train, tune, report))
-    print(f"{gait}: {len(train)}, {len(tune)} and {len(report)} episodes to fit, choose and "
+    fitted, tuned, held = (data.rows(np.isin(data.episode, own)) for own in (train, tune, told))
+    print(f"{gait}: {len(train)}, {len(tune)} and {len(told)} episodes to fit, choose and "
           f"report, {len(fitted.x)} rows to fit", flush=True)  # fmt: skip
     landing = open_loop.fit_landing(fitted)
     out: dict[str, Any] = {
-        "episodes": {"fit": train, "choose": tune, "report": report},
+        "episodes": {"fit": train, "choose": tune, "report": told},
         "fit": {},
         "inside": {},
         "all_starts": {},
@@ -309,7 +284,7 @@ def study(
                         curves[where, full_name] = {
                             key: np.sqrt(value[calm].mean(axis=0)) for key, value in errors.items()
                         }
-        _print(gait, where, out[where])
+        report.show(gait, where, out[where])
     return out, curves, fits, held
 
 
@@ -355,29 +330,6 @@ def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str
                     key: ratios[key] for key in ("velocity", "omega")
                 }
     return out
-
-
-def table(families: dict[str, Any]) -> str:
-    """Rms errors of every model inside a stance, as Markdown."""
-    heads = [f"{gait}, {name}" for gait in families for name in HORIZONS]
-    lines = [
-        "| inside a stance of the whole robot, as an LMPC predicts | "
-        + " | ".join(f"{head}: velocity [m/s], ratio; pitch rate [rad/s], ratio" for head in heads)
-        + " |",
-        "|---" * (1 + len(heads)) + "|",
-    ]
-    for label in next(iter(families.values())):
-        cells = []
-        for models in families.values():
-            for name in HORIZONS:
-                entry = models[label][name]
-                cells.append("; ".join(
-                    f"{e['rms']:.3f}, {e['ratio']:.2f} ({e['interval'][0]:.2f} to "
-                    f"{e['interval'][1]:.2f})" for e in (entry["velocity"], entry["omega"])
-                ))  # fmt: skip
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    lines.append("\nRatio: to the error of the planted rigid body, integrated, not linearised.")
-    return "\n".join(lines) + "\n"
 
 
 def _choose(
@@ -473,66 +425,6 @@ def _fit_report(fit: whole_body.Fit, gains: np.ndarray) -> dict[str, Any]:
         for mode in Mode
         if fit.rows[mode] > 0
     }
-
-
-def _print(gait: str, where: str, table: dict[str, Any]) -> None:
-    print(f"\n{gait}, {where.replace('_', ' ')}: error over that of the same scheme's nominal "
-          "[95 %], held-out episodes")  # fmt: skip
-    print(f"  {'':24}{'':6}{'velocity':>22}{'pitch rate':>22}")
-    for name, horizons in table.items():
-        for horizon, entry in horizons.items():
-            cells = []
-            for key, unit in (("velocity", "m/s"), ("omega", "rad/s")):
-                one = entry["all"][key]
-                low, high = one["interval"]
-                text = f"{one['rms']:.3f} {unit}"
-                if not name.endswith("nominal"):
-                    text = f"{one['ratio']:.3f} [{low:.3f} {high:.3f}]"
-                cells.append(f"{text:>22}")
-            print(f"  {name:24}{horizon:6}{''.join(cells)}", flush=True)
-
-
-def save_figure(curves: dict[str, Any], path: Path) -> None:
-    """Root-mean-square error against the horizon, inside a stance and over all start points.
-
-    Over all start points the predictions follow the schedule, but for the dashed one.
-    """
-    from kjax.viz import plots
-    from kjax.viz.plots import plt
-
-    colours = {"nominal": plots.DARK, "affine": plots.BLUE, "clock_history": "#2f855a",
-               "touchdown": plots.RED}  # fmt: skip
-    columns = [(gait, where) for gait in curves for where in ("inside", "all_starts")]
-    with plt.rc_context(plots.STYLE | {"lines.linewidth": 1.3}):
-        fig, axes = plt.subplots(
-            2, len(columns), figsize=(2.3 * len(columns), 4.6), sharex=True, squeeze=False
-        )
-        for column, (gait, where) in zip(axes.T, columns, strict=True):
-            scheme = "" if where == "inside" else "scheduled "
-            for axis, key in zip(column, ("velocity", "omega"), strict=True):
-                for name, colour in colours.items():
-                    if name == "touchdown" and where == "inside":
-                        continue
-                    curve = curves[gait][where, scheme + name][key]
-                    time_ms = 1e3 * DT * np.arange(1, len(curve) + 1)
-                    axis.plot(time_ms, curve, "o-", ms=2.5, color=colour, label=LABELS[name])
-                if where == "all_starts":
-                    frozen = curves[gait][where, "frozen nominal"][key]
-                    axis.plot(time_ms, frozen, "--", color=plots.GREY,
-                              label="rigid body, present feet kept")  # fmt: skip
-                # Feet kept through a bound's flight would press all others flat.
-                highest = curves[gait][where, scheme + "nominal"][key][-1]
-                axis.set_ylim(0.0, 1.1 * highest if where == "inside" else 1.5 * highest)
-            place = "inside a stance" if where == "inside" else "all start points"
-            column[0].set_title(f"{gait}, {place}", loc="left", fontsize=8)
-            column[1].set_xlabel("horizon [ms]")
-        axes[0, 0].set_ylabel("velocity error, rms [m/s]")
-        axes[1, 0].set_ylabel("pitch rate error, rms [rad/s]")
-        handles, labels = axes[0, 1].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="lower center", ncol=3)
-        fig.tight_layout(rect=(0.0, 0.1, 1.0, 1.0))
-        fig.savefig(path, dpi=160)
-        plt.close(fig)
 
 
 if __name__ == "__main__":
