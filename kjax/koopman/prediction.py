@@ -118,11 +118,12 @@ def _fit_bilinear(body: srb.SrbParams, config: KoopmanConfig, key: Array) -> tup
 
 
 def _stored(config: KoopmanConfig) -> storage.Stored:
-    path = Path(config.file)
+    path = storage.resolve(config.file)
     try:
-        changed = path.stat().st_mtime_ns
+        content = path.stat()
+        changed = (content.st_mtime_ns, content.st_size, content.st_ino)
     except OSError:
-        changed = 0
+        changed = (0, 0, 0)
     stored = _read(path, config.model, changed)
     if abs(stored.dt - config.dataset.dt) > 1e-9:
         raise ConfigError(
@@ -133,5 +134,5 @@ def _stored(config: KoopmanConfig) -> storage.Stored:
 
 
 @lru_cache(maxsize=8)
-def _read(path: Path, family: str, changed: int) -> storage.Stored:
+def _read(path: Path, family: str, changed: tuple[int, int, int]) -> storage.Stored:
     return storage.load(path, family)

@@ -7,11 +7,11 @@ import numpy as np
 
 from kjax.sim.episode import Trajectory
 
-EVERY = 5  # physics steps, a control tick by default
+PERIOD = 0.005  # s between two samples, a control tick by default
 
 
 class Series(NamedTuple):
-    """Every fifth step of a ``Trajectory``; fields as there.
+    """A ``Trajectory`` thinned to one sample per ``PERIOD``; fields as there.
 
     Attributes:
       time: (N,) [s].
@@ -33,13 +33,21 @@ class Series(NamedTuple):
 
 
 def save_series(run: Trajectory, path: Path) -> None:
-    """Write the series of a run to an ``.npz``."""
-    values = {name: np.asarray(getattr(run, name))[::EVERY] for name in Series._fields}
+    """Write the series of a run to an ``.npz``, whole or not at all.
+
+    Args:
+      run: sampled at the physics rate, or from a batch at the control rate.
+      path: of the file.
+    """
+    every = max(1, round(PERIOD / run.dt))
+    values = {name: np.asarray(getattr(run, name))[::every] for name in Series._fields}
     single: dict[str, Any] = {
         name: value.astype(np.float32) if value.dtype == np.float64 else value
         for name, value in values.items()
     }
-    np.savez_compressed(path, **single)
+    scratch = path.with_name(f".{path.name}.part.npz")
+    np.savez_compressed(scratch, **single)
+    scratch.replace(path)
 
 
 def load_series(path: Path) -> Series:
