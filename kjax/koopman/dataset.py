@@ -1,13 +1,16 @@
-"""Random SRB rollouts for EDMD: vmapped over rollouts and over contact modes."""
+"""Samples for EDMD: random SRB rollouts, vmapped over contact modes, or one's own episodes."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax import srb
 from kjax.config import DatasetConfig
+from kjax.types import INPUT_DIM, STATE_DIM
 
 _PIECE = 256  # rollouts that are integrated side by side
 
@@ -108,3 +111,75 @@ def sample(
     else:
         states = jax.vmap(one)(x0, inputs, feet)
     return Snapshots(states=states, inputs=inputs, feet=feet)
+
+
+def from_episodes(episodes: Sequence[Any], *, window: int = 1) -> Snapshots:
+    """Snapshots of recorded episodes of any lengths, one for each of their steps.
+
+        snapshots = from_episodes([(x_1, u_1, feet_1), (x_2, u_2, feet_2)])
+        remarks = edmd.check_snapshots(snapshots, dictionary, dt=0.005)
+        model, report = edmd.fit(dictionary, snapshots)
+
+    A model is of one contact mode: cut recordings where the contacts change, and give the pieces of
+    one mode. Steps must be equally long throughout.
+
+    Args:
+      episodes: of each a tuple of states (T + 1, 6) ``[m, rad, m/s, rad/s]``, inputs (T, 4) held
+        from each state to the next, per leg in the body frame [N], and contact points (2, 2) or,
+        where they move, (T, 2, 2), front and rear, body frame [m]. T may differ between episodes.
+      window: states that the dictionary looks at, ``Dictionary.window``.
+
+    Returns:
+      Rollouts of ``window`` steps, which overlap where the window is above 1, so that every step
+      with its history is in the fit once. Episodes that are shorter are left out.
+
+    Raises:
+      ValueError: naming the episode that is none, or if none is long enough.
+    """
+    if window < 1:
+        raise ValueError(f"window must be at least 1, got {window}")
+    if not len(episodes):
+        raise ValueError("episodes must hold at least one, got none")
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for number, episode in enumerate(episodes):
+        states, inputs, feet = _episode(number, episode)
+        count = len(inputs) - window + 1
+        if count > 0:
+            first = np.arange(count)[:, None]
+            parts.append(
+                (
+                    states[first + np.arange(window + 1)],
+                    inputs[first + np.arange(window)],
+                    feet[window - 1 :],
+                )
+            )
+    if not parts:
+        raise ValueError(f"episodes: no episode is longer than {window} states")
+    return Snapshots(*(jnp.asarray(np.concatenate(a)) for a in zip(*parts, strict=True)))
+
+
+def _episode(number: int, episode: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States (T + 1, 6), inputs (T, 4) and contact points (T, 2, 2) of an episode."""
+    if len(episode) != 3:
+        raise ValueError(
+            f"episodes[{number}] must be a tuple of states, inputs and feet, got {len(episode)} "
+            "arrays"
+        )
+    states, inputs, feet = (np.asarray(a) for a in episode)
+    if states.ndim != 2 or states.shape[1] != STATE_DIM:
+        raise ValueError(f"episodes[{number}]: states have shape {states.shape}, wanted (T + 1, 6)")
+    if inputs.ndim != 2 or inputs.shape[1] != INPUT_DIM:
+        raise ValueError(f"episodes[{number}]: inputs have shape {inputs.shape}, wanted (T, 4)")
+    if len(states) != len(inputs) + 1:
+        raise ValueError(
+            f"episodes[{number}] holds {len(states)} states and {len(inputs)} inputs, wanted one "
+            "more state than inputs: each input acts from one state to the next"
+        )
+    if feet.shape == (2, 2):
+        feet = np.broadcast_to(feet, (len(inputs), 2, 2))
+    if feet.shape != (len(inputs), 2, 2):
+        raise ValueError(
+            f"episodes[{number}]: feet have shape {feet.shape}, wanted (2, 2) or "
+            f"({len(inputs)}, 2, 2)"
+        )
+    return states, inputs, feet

@@ -18,11 +18,33 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from kjax import srb
 from kjax.config import KoopmanConfig, SrbConfig
 from kjax.koopman import regression
+from kjax.koopman.checks import check_snapshots, require_dataset, require_rows, require_steps
 from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
 from kjax.koopman.families import BilinearModel
 from kjax.koopman.models import LinearModel
-from kjax.koopman.observables import STATE_ROWS, Dictionary, fourier, monomials, paper
-from kjax.types import INPUT_DIM, MODE_ALPHA, STATE_DIM, Mode
+from kjax.koopman.observables import (
+    STATE_ROWS,
+    Dictionary,
+    fourier,
+    lift_all,
+    monomials,
+    paper,
+)
+from kjax.types import INPUT_DIM, MODE_ALPHA, Mode
+
+__all__ = [
+    "FitReport",
+    "build_dictionary",
+    "check_snapshots",
+    "fit",
+    "fit_bilinear",
+    "fit_modes",
+    "lift_all",
+    "linear_model",
+    "regressors",
+    "spectrum",
+    "srb_params",
+]
 
 Point = tuple[float, float]  # (x, z) [m]
 
@@ -47,17 +69,6 @@ class FitReport(NamedTuple):
     finite: Array
 
 
-def lift_all(
-    dictionary: Dictionary, states: Float[Array, "rollouts steps_plus_1 6"]
-) -> Float[Array, "rollouts T N"]:
-    """Lifted states of all rollouts; with delay coordinates from the first full window on."""
-    if dictionary.window == 1:
-        return jax.vmap(jax.vmap(dictionary.lift))(states)
-    count = states.shape[1] - dictionary.window + 1
-    place = np.arange(count)[:, None] + np.arange(dictionary.window)
-    return jax.vmap(jax.vmap(dictionary.lift))(states[:, place])
-
-
 def regressors(
     dictionary: Dictionary,
     data: Snapshots,
@@ -69,7 +80,12 @@ def regressors(
 
     The rows are ``[Pi(x), u]``; with ``feet_terms`` ``[Pi(x), u, r (x) u]``, and ``bilinear``
     ``[Pi(x), Pi(x) (x) u]``, which holds u as the product with the constant.
+
+    Raises:
+      ValueError: for no rollouts, or rollouts too short for a step.
     """
+    require_steps(data.states.shape, dictionary)
+    data = Snapshots(*map(jnp.asarray, data))
     lifted = lift_all(dictionary, data.states)
     now, then = lifted[:, :-1], lifted[:, 1:]
     inputs = data.inputs[:, dictionary.window - 1 :]
@@ -103,9 +119,14 @@ def fit(
       feet_terms: fit the dependence of B on the contact points as well (they must vary).
       ridge: penalty of the weights in scaled columns [-].
       use: (N,) observables to use: many dictionaries in one ``vmap`` are cuts of a large one.
+
+    Raises:
+      ValueError: for no rollouts, and for fewer snapshots than regressors without a ridge.
     """
     N = dictionary.size
     Z, Y = regressors(dictionary, data, feet_terms=feet_terms)
+    if use is None and isinstance(ridge, float | int) and ridge == 0:
+        require_rows(*Z.shape)
     use = None if use is None else jnp.concatenate([use, jnp.ones((Z.shape[1] - N,), bool)])
     rows = regression.of_rows(Z, Y)
     weights = regression.solve(rows, Z.shape[1], ridge=ridge, use=use)
@@ -130,6 +151,8 @@ def fit_bilinear(
     """Bilinear model of one contact mode and a report; arguments as of ``fit``."""
     N = dictionary.size
     Z, Y = regressors(dictionary, data, feet_terms=feet_terms, bilinear=True)
+    if isinstance(ridge, float | int) and ridge == 0:
+        require_rows(*Z.shape)
     rows = regression.of_rows(Z, Y)
     weights = regression.solve(rows, Z.shape[1], ridge=ridge)
     K = weights.W.T
@@ -165,66 +188,6 @@ def _report(rows: regression.Triangle, weights: regression.Weights) -> FitReport
         residual_rms=regression.rms(rows, weights.W)[STATE_ROWS],
         finite=jnp.isfinite(rows.R).all() & jnp.isfinite(weights.W).all(),
     )
-
-
-def check_snapshots(
-    data: Snapshots, dictionary: Dictionary, *, dt: float, columns: int | None = None
-) -> list[str]:
-    """Look at the data before a fit, on the host.
-
-    Args:
-      data: snapshots of one mode.
-      dictionary: observables.
-      dt: step between the states [s].
-      columns: number of regressors; that of the linear model if ``None``.
-
-    Returns:
-      Remarks that are no errors: observables that do not vary.
-
-    Raises:
-      ValueError: for wrong shapes, numbers that are not finite, fewer snapshots than regressors,
-        and for a rollout whose positions do not follow from its velocities, as where two episodes
-        were put into one.
-    """
-    states, inputs = (np.asarray(a) for a in (data.states, data.inputs))
-    if states.ndim != 3 or states.shape[-1] != STATE_DIM:
-        raise ValueError(f"states: got shape {states.shape}, wanted (rollouts, steps + 1, 6)")
-    wanted = (states.shape[0], states.shape[1] - 1, INPUT_DIM)
-    if inputs.shape != wanted:
-        raise ValueError(f"inputs: got shape {inputs.shape}, wanted {wanted} for these states")
-    if np.shape(data.feet) != (states.shape[0], 2, 2):
-        raise ValueError(f"feet: got shape {np.shape(data.feet)}, wanted ({len(states)}, 2, 2)")
-    for name, values in (("states", states), ("inputs", inputs), ("feet", np.asarray(data.feet))):
-        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if bad.any():
-            raise ValueError(
-                f"{name}: {int(bad.sum())} of {len(bad)} rollouts hold numbers that are not "
-                f"finite, the first one is rollout {int(np.argmax(bad))}"
-            )
-    rows = states.shape[0] * (states.shape[1] - dictionary.window)
-    columns = dictionary.size + INPUT_DIM if columns is None else columns
-    if rows < columns:
-        raise ValueError(f"{rows} snapshots are too few for {columns} regressors")
-    moved = np.diff(states[..., :3], axis=1)
-    drift = np.abs(moved - dt * 0.5 * (states[:, 1:, 3:] + states[:, :-1, 3:])).max(axis=2)
-    # Half a step's change of velocity is the largest miss that a smooth motion has.
-    change = np.abs(np.diff(states[..., 3:], axis=1)).max(axis=2)
-    jump = drift > dt * (change + 1.0) + 1e-3
-    if jump.any():
-        rollout, step = np.argwhere(jump)[0]
-        raise ValueError(
-            f"states: rollout {rollout} jumps by {drift[rollout, step]:.3g} between steps {step} "
-            f"and {step + 1}, which its velocity does not explain: are there two episodes in it, "
-            f"or is dt {dt} s not its step?"
-        )
-    lifted = np.asarray(lift_all(dictionary, jnp.asarray(states))).reshape(-1, dictionary.size)
-    spread = np.ptp(lifted, axis=0)
-    still = spread <= 1e-9 * np.maximum(np.abs(lifted).max(axis=0), 1e-30)
-    return [
-        f"observable '{dictionary.names[i]}' does not vary in the data: it counts as a constant"
-        for i in np.flatnonzero(still)
-        if i > 0
-    ]
 
 
 def spectrum(A: Float[np.ndarray, "N N"], dt: float) -> np.ndarray:
@@ -287,6 +250,7 @@ def fit_modes(
     dictionary = build_dictionary(config)
     data = config.dataset
     vary_feet = config.feet == "measured"
+    require_dataset(data, dictionary.size + INPUT_DIM + (8 if vary_feet else 0))
     limits = ranges_from_config(data, vary_feet=vary_feet) if ranges is None else ranges
 
     def one(key: Array, alpha: Array, body: srb.SrbParams) -> tuple[LinearModel, FitReport]:

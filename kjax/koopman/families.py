@@ -130,6 +130,7 @@ class Family(NamedTuple):
 
 def linear(dictionary: Dictionary, dt: float, name: str = "linear") -> Family:
     """Linear models in a dictionary's observables; numbers are a ``LinearModel``."""
+    _require_one_state(dictionary)
 
     def step(numbers: LinearModel, start: Start, z: Array, u: Array) -> Array:
         return numbers.A @ z + input_map(numbers, start.feet) @ u
@@ -139,11 +140,20 @@ def linear(dictionary: Dictionary, dt: float, name: str = "linear") -> Family:
 
 def bilinear(dictionary: Dictionary, dt: float) -> Family:
     """Bilinear models in a dictionary's observables; numbers are a ``BilinearModel``."""
+    _require_one_state(dictionary)
 
     def step(numbers: BilinearModel, start: Start, z: Array, u: Array) -> Array:
         return numbers.step(z, u, start.feet)
 
     return Family("bilinear", dt, dictionary.names, lambda _, start: dictionary.lift(start.x), step)
+
+
+def _require_one_state(dictionary: Dictionary) -> None:
+    if dictionary.window > 1:
+        raise ValueError(
+            f"dictionary looks at {dictionary.window} states (delay coordinates), a family takes "
+            "one state: roll the model out from recorded motion with models.rollout"
+        )
 
 
 def rigid_body(dt: float) -> Family:

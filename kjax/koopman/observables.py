@@ -180,6 +180,17 @@ def delays(dictionary: Dictionary, count: int) -> Dictionary:
     )
 
 
+def lift_all(
+    dictionary: Dictionary, states: Float[Array, "rollouts steps_plus_1 6"]
+) -> Float[Array, "rollouts T N"]:
+    """Lifted states of all rollouts; with delay coordinates from the first full window on."""
+    if dictionary.window == 1:
+        return jax.vmap(jax.vmap(dictionary.lift))(states)
+    count = states.shape[1] - dictionary.window + 1
+    place = np.arange(count)[:, None] + np.arange(dictionary.window)
+    return jax.vmap(jax.vmap(dictionary.lift))(states[:, place])
+
+
 def _dictionary(
     extra: Callable[[Float[Array, "6"]], Float[Array, "E"]],
     names: tuple[str, ...],

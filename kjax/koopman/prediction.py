@@ -11,12 +11,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from kjax import srb
 from kjax.config import ConfigError, KoopmanConfig
 from kjax.koopman import families, features, storage
+from kjax.koopman.checks import require_dataset
 from kjax.koopman.dataset import ranges_from_config, sample
 from kjax.koopman.edmd import build_dictionary, fit_bilinear
 from kjax.koopman.families import BodyModel, Family, ResidualModel
 from kjax.koopman.learned import learned
 from kjax.koopman.observables import states_only
-from kjax.types import MODE_ALPHA, Mode
+from kjax.types import INPUT_DIM, MODE_ALPHA, Mode
 
 
 class Prediction(NamedTuple):
@@ -103,6 +104,7 @@ def build_prediction(
 def _fit_bilinear(body: srb.SrbParams, config: KoopmanConfig, key: Array) -> tuple[Any, Any, Any]:
     dictionary, data = build_dictionary(config), config.dataset
     measured = config.feet == "measured"
+    require_dataset(data, dictionary.size * (1 + INPUT_DIM) + (8 if measured else 0))
 
     def one(key: Array, alpha: Array, body: srb.SrbParams) -> tuple[Any, Any]:
         ranges = ranges_from_config(data, vary_feet=measured)
