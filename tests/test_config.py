@@ -11,6 +11,7 @@ from kjax.config import (
     LmpcConfig,
     RunConfig,
     SrbConfig,
+    SweepConfig,
     fields,
     load_config,
     to_dict,
@@ -73,6 +74,8 @@ def message(overrides, cls=RunConfig, path=None):
             {"gait.landing_time": 0.002},
             ("gait.landing_time", "0.002", "lmpc.control_dt", "0.005"),
         ),
+        ({"duration": 0.004}, ("duration", "0.004", "lmpc.control_dt 0.005")),
+        ({"duration": 0.0}, ("duration", "got 0.0", "greater than 0")),
         ({"lmpc.force_z_min": 200.0}, ("lmpc", "force_z_min", "200.0", "160.0")),
         ({"lmpc.model_dt": 0.0015}, ("lmpc.model_dt", "multiple", "0.0015")),
         ({"lmpc.control_dt": 0.0004}, ("lmpc.control_dt", "multiple", "0.0004")),
@@ -103,6 +106,56 @@ def test_broken_toml_is_reported_with_its_place(tmp_path):
     bad = tmp_path / "bad.toml"
     bad.write_text("duration = = 3\n")
     assert "line 1" in message({}, path=bad)
+
+
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
+    path = tmp_path / "walk.toml"
+    path.write_bytes("duration = 3.0 # größer\n".encode("utf-8-sig"))
+    assert load_config(RunConfig, path).duration == 3.0
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfed\x00", "größe = 1".encode("latin-1"), b"\0" * 9])
+def test_a_file_that_is_no_text_is_named(tmp_path, content):
+    path = tmp_path / "walk.toml"
+    path.write_bytes(content)
+    assert f"{path}: not valid TOML" in message({}, path=path)
+    assert f"{tmp_path}: cannot be read" in message({}, path=tmp_path)
+
+
+RUN, SWEEP, FIT = "trot_velocity.toml", "sweeps/push_trot.toml", "koopman_fit.toml"
+
+
+@pytest.mark.parametrize(
+    ("cls", "name", "kind", "command"),
+    [
+        (SweepConfig, RUN, "a closed-loop run", "experiments/closed_loop.py"),
+        (SweepConfig, FIT, "a fit study", "experiments/koopman_fit.py"),
+        (RunConfig, SWEEP, "a sweep", "experiments/sweep.py"),
+        (RunConfig, FIT, "a fit study", "experiments/koopman_fit.py"),
+        (FitStudyConfig, RUN, "a closed-loop run", "experiments/closed_loop.py"),
+        (FitStudyConfig, SWEEP, "a sweep", "experiments/sweep.py"),
+    ],
+)
+def test_a_config_of_another_kind_is_named_with_what_takes_it(cls, name, kind, command, repository):
+    path = repository / "configs" / name
+    text = message({}, cls=cls, path=path)
+    assert f"{path} is the file of {kind}, which {command} takes" in text
+    assert "{" not in text
+    assert len(text) < 300
+
+
+def test_a_mistake_in_a_file_of_the_right_kind_is_still_the_key_s(tmp_path):
+    path = tmp_path / "sweep.toml"
+    path.write_text('base = "walk.toml"\nseedz = 4\n[axes.a]\nvalues = [1]\n')
+    assert "seedz: unknown key (got 4); did you mean 'seeds'?" in message({}, SweepConfig, path)
+    path.write_text("[axes.a]\nvalues = [1]\n")
+    assert "base: missing, it has no default" in message({}, SweepConfig, path)
+    path.write_text("[project]\nname = 'x'\n[tool.ruff]\nline = 3\n")
+    assert "project: unknown key (got {'name': 'x'})" in message({}, RunConfig, path)
+    path.write_text("[project]\n" + "".join(f"key_{i} = 'long'\n" for i in range(40)))
+    assert "project: unknown key (got a section of 40 keys)" in message({}, RunConfig, path)
+    path.write_text(f"duration = [{'1, ' * 200}1]\n")
+    assert len(message({}, RunConfig, path)) < len(str(path)) + 150
 
 
 def test_overrides_win_over_the_file(tmp_path):

@@ -45,13 +45,15 @@ def load_config(
     if path is not None:
         source = str(path)
         try:
-            data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            # Editors on Windows put a byte order mark first, which TOML has not.
+            data = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
         except FileNotFoundError:
             raise ConfigError(f"{source}: no such file{_nearest_file(Path(path))}") from None
         except OSError as error:
             raise ConfigError(f"{source}: cannot be read: {error.strerror}") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    given = dict(data)
     for key, value in (overrides or {}).items():
         *sections, leaf = key.split(".")
         node = data
@@ -64,7 +66,12 @@ def load_config(
         # Through JSON, since strict mode then takes lists for tuples but still no "3" for 3.
         return TypeAdapter(cls).validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_explain(error, cls)}") from None
+        from kjax.config.kinds import other_kind  # it imports the classes that this file fills
+
+        text = other_kind(given, cls)
+        raise ConfigError(
+            f"{source} {text}" if text else f"{source}: {_explain(error, cls)}"
+        ) from None
 
 
 def _explain(error: ValidationError, cls: type) -> str:
@@ -78,7 +85,9 @@ def _explain(error: ValidationError, cls: type) -> str:
         names |= {name.rsplit(".", 1)[0] for name in names if "." in name}
         near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
         hint = f"; did you mean '{near[0]}'?" if near else ""
-        text = f"{key}: unknown key (got {came!r}){hint}"
+        text = f"{key}: unknown key (got {_short(came)}){hint}"
+    elif first["type"].startswith("missing") and isinstance(first["loc"][-1], str):
+        text = f"{key}: missing, it has no default"
     elif first["type"] == "value_error":
         wish = first["msg"].removeprefix("Value error, ")
         text = f"{key}: {wish}" if key else wish
@@ -87,8 +96,16 @@ def _explain(error: ValidationError, cls: type) -> str:
         options = [str(o) for o in first.get("ctx", {}).get("expected", "").split("'")[1::2]]
         near = difflib.get_close_matches(str(came), options, n=1, cutoff=0.5)
         hint = f"; did you mean '{near[0]}'?" if near else ""
-        text = f"{key}: got {came!r}, wanted {wish}{hint}"
+        text = f"{key}: got {_short(came)}, wanted {wish}{hint}"
     return text + (f" (and {len(rest)} more)" if rest else "")
+
+
+def _short(value: Any) -> str:
+    """A value as shown in a message, on one line."""
+    text = repr(value)
+    if len(text) <= 60:
+        return text
+    return f"a section of {len(value)} keys" if isinstance(value, dict) else text[:57] + "..."
 
 
 def _nearest_file(path: Path) -> str:

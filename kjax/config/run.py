@@ -64,6 +64,11 @@ class RunConfig:
         lateral = self.push.lateral
         if self.sim.base == "planar" and any(lateral if isinstance(lateral, tuple) else [lateral]):
             raise ValueError(f"push.lateral needs sim.base = 'free', got {lateral} and 'planar'")
+        if self.duration < self.lmpc.control_dt:
+            raise ValueError(
+                f"duration is {self.duration} s, shorter than lmpc.control_dt "
+                f"{self.lmpc.control_dt} s"
+            )
         bound = self.bound
         shortest = {
             "gait.stance_time": self.gait.stance_time,
