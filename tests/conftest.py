@@ -199,6 +199,48 @@ def random_qp():
 
 
 @pytest.fixture(scope="session")
+def standing_run():
+    """Factory of made-up runs that stand still: (config, seconds, **fields) -> Trajectory."""
+    from kjax.sim.episode import Trajectory
+
+    def build(config, seconds, **fields):
+        count = round(seconds / config.sim.sim_dt)
+        quat = {"free": [0.0, 1.0, 0.0, 0.0, 0.0], "planar": [0.0]}[config.sim.base]
+        pose = np.concatenate([[0.0, 0.27] if len(quat) == 1 else [0.0, 0.0], quat, np.zeros(12)])
+        if len(quat) > 1:
+            pose[2] = 0.27
+        x = np.tile([0.0, 0.27, 0.0, 0.0, 0.0, 0.0], (count, 1))
+        zeros = np.zeros(count)
+        values = {
+            "dt": config.sim.sim_dt,
+            "time": np.arange(count) * config.sim.sim_dt,
+            "qpos": np.tile(pose, (count, 1)),
+            "qvel": np.zeros((count, len(pose) - (len(quat) > 1))),
+            "x": x,
+            "feet": np.zeros((count, 4, 2)),
+            "foot_force": np.full((count, 4), 30.0),
+            "torque": np.zeros((count, 4, 3)),
+            "gait": np.zeros(count, int),
+            "stance": np.ones((count, 4), bool),
+            "force": np.zeros((count, 4, 2)),
+            "velocity_command": zeros,
+            "velocity_reference": zeros,
+            "body_contact": np.zeros(count // 5, bool),
+            "plan_status": np.ones(count // 5, int),
+            "plan_residual": np.zeros(count // 5),
+            "plan_iterations": np.ones(count // 5, int),
+            "plan_time": np.full(count // 5, 1e-4),
+            "act_time": np.full(count, 1e-5),
+            "wall_time": 0.1,
+            "fell": False,
+            "interrupted": False,
+        }
+        return Trajectory(**{**values, **fields})
+
+    return build
+
+
+@pytest.fixture(scope="session")
 def repository():
     """Root folder of the checkout."""
     return Path(__file__).parents[1]

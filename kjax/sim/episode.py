@@ -245,6 +245,34 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
     return result
 
 
+def metric_names(config: RunConfig) -> set[str]:
+    """Keys of ``metrics`` of an episode of this config, but for those of wall time.
+
+    An episode that ends before the robot has settled (``SETTLE_TIME``) has the first four only.
+    """
+    names = {"fell", "fall_time_s", "interrupted", "simulated_s"}
+    if config.duration <= SETTLE_TIME:
+        return names
+    names |= {
+        "velocity_rmse_mps", "velocity_reference_rmse_mps", "pitch_max_deg", "pitch_p95_deg",
+        "height_mean_m", "height_min_m", "height_max_m", "distance_m", "foot_slip_m",
+        "torque_max_nm", "torque_saturation_fraction", "abduction_saturation_fraction",
+        "thigh_saturation_fraction", "knee_saturation_fraction", "body_contact_fraction",
+        "qp_unsolved", "qp_iterations_median",
+    }  # fmt: skip
+    if config.duration > config.command.times[-1] + LATE_TIME:
+        names |= {"velocity_late_mean_mps", "velocity_late_rmse_mps"}
+    if config.terrain.kind == "flat":
+        names |= {"height_error_max_m", "height_error_mean_m"}
+    else:
+        names |= {"crossed", "field_pitch_p95_deg"}
+    if len(config.gait.times) > 1:
+        names |= {"switch_time_s", "switch_pitch_max_deg", "pitch_settle_s"}
+    if config.sim.base == "free":
+        names |= {"roll_max_deg", "yaw_max_deg", "lateral_drift_m"}
+    return names
+
+
 def _tracking(run: Trajectory, config: RunConfig) -> dict[str, Any]:
     """Speed against what the LMPC is given and late in the run; height against the configured one.
 

@@ -1,6 +1,8 @@
 """From a sweep's axes to its cases: a grid or a random sample, times seeds."""
 
 import ast
+import difflib
+import math
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from kjax.config import AxisConfig, ConfigError, RunConfig, SweepConfig, load_config
+from kjax.sim.episode import metric_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +40,7 @@ def plan(sweep: SweepConfig, file: Path) -> Plan:
       file: that it came from; ``base`` is seen from there.
 
     Raises:
-      ConfigError: naming the key that no run can be made of.
+      ConfigError: naming the key that no run can be made of, or that no figure can be drawn of.
     """
     seeds = np.arange(sweep.first_seed, sweep.first_seed + sweep.seeds)
     names = tuple(sweep.axes)
@@ -65,12 +68,34 @@ def plan(sweep: SweepConfig, file: Path) -> Plan:
     base = file.parent / sweep.base
     cases = []
     for point in points:
-        keys = {key: _fill(value, point, f"set.{key}") for key, value in sweep.set.items()}
+        keys = {key: _fill(value, point, f"{file}: set.{key}") for key, value in sweep.set.items()}
         for seed in seeds:
             own = {**keys, "seed": int(seed), "terrain.seed": int(seed)}
             cases.append(_load(base, own, point, file))
+    _check_figure(sweep, dims, cases, file)
     coords["seed"] = (("seed",), seeds, "-")
     return Plan(dims=(*dims, "seed"), coords=coords, shape=(*shape, len(seeds)), cases=cases)
+
+
+def _check_figure(
+    sweep: SweepConfig, dims: tuple[str, ...], cases: list[RunConfig], file: Path
+) -> None:
+    """Refuse a figure of axes or metrics that there are none of, before anything walks."""
+    wish = sweep.figure
+    if wish is None:
+        return
+    for key in ("x", "y", "panels"):
+        name = getattr(wish, key)
+        if name and name not in dims:
+            raise ConfigError(
+                f"{file}: figure.{key}: no axis named '{name}', there are {', '.join(dims)}"
+            )
+    known = {"success"}.union(*(metric_names(case) for case in cases))
+    for name in wish.metrics:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(sorted(known))}"
+            raise ConfigError(f"{file}: figure.metrics: no metric named '{name}'; {hint}")
 
 
 def _load(base: Path, keys: Mapping[str, Any], point: Mapping[str, Any], file: Path) -> RunConfig:
@@ -118,8 +143,9 @@ def evaluate(text: str, names: Mapping[str, Any], key: str) -> Any:
     """Value of an expression of names, numbers, + - * / and brackets; a name alone may be text.
 
     Raises:
-      ConfigError: naming the key, for anything else.
+      ConfigError: naming the key, for anything else, and where the value is no finite number.
     """
+    unwanted = ConfigError(f"{key}: got '= {text}', wanted numbers, axes and + - * / ( )")
 
     def value(node: ast.AST) -> Any:
         match node:
@@ -127,16 +153,29 @@ def evaluate(text: str, names: Mapping[str, Any], key: str) -> Any:
                 return names[name]
             case ast.Name(id=name):
                 raise ConfigError(f"{key}: no axis named '{name}', there are {', '.join(names)}")
-            case ast.Constant(value=int() | float() as number):
+            case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
                 return number
             case ast.UnaryOp(op=sign, operand=inner) if type(sign) in _OPERATORS:
-                return _OPERATORS[type(sign)](value(inner))
+                return _OPERATORS[type(sign)](number_of(inner))
             case ast.BinOp(left=left, op=sign, right=right) if type(sign) in _OPERATORS:
-                return _OPERATORS[type(sign)](value(left), value(right))
-        raise ConfigError(f"{key}: got '= {text}', wanted numbers, axes and + - * / ( )")
+                return _OPERATORS[type(sign)](number_of(left), number_of(right))
+        raise unwanted
 
+    def number_of(node: ast.AST) -> Any:
+        found = value(node)
+        if isinstance(found, bool) or not isinstance(found, int | float):
+            raise unwanted
+        return found
+
+    where = ", ".join(f"{name} = {there}" for name, there in names.items())
     try:
-        tree = ast.parse(text, mode="eval")
+        found = value(ast.parse(text, mode="eval").body)
     except SyntaxError:
-        raise ConfigError(f"{key}: got '= {text}', wanted numbers, axes and + - * / ( )") from None
-    return value(tree.body)
+        raise unwanted from None
+    except ZeroDivisionError:
+        raise ConfigError(f"{key}: got '= {text}', which divides by zero at {where}") from None
+    except OverflowError:
+        found = math.inf
+    if isinstance(found, float) and not math.isfinite(found):
+        raise ConfigError(f"{key}: got '= {text}', which is no finite number at {where}")
+    return found

@@ -72,6 +72,13 @@ def test_a_sample_is_drawn_from_the_ranges_and_again_the_same(file):
         ('"= speed"', '"= speed +"', r"wanted numbers, axes and"),
         ('"= speed"', '"fast"', r"at speed = 0\.2.*command\.velocities"),
         ('"command.velocities"', '"command.velocity"', r"command\.velocity: unknown key"),
+        (
+            "duty * 0.4",
+            "0.4 / (duty - 0.1)",
+            r"bound\.front_stance: got '= 0\.4 / \(duty - 0\.1\) .*"
+            r"divides by zero at speed = 0\.2, duty = 0\.1",
+        ),
+        ("duty * 0.4", "1e308 * 1e308 * duty", r"front_stance: got .* no finite number at speed"),
         ("count = 3", "", r"axes\.duty: a grid needs a count"),
         ("values = [0.2, 0.4]", "", r"axes\.speed: give either values, or low and high"),
         ("high = 0.3", "high = 0.05", r"low must be below high"),
@@ -85,6 +92,46 @@ def test_a_mistake_is_one_line_that_names_the_key(file, old, new, said):
     with pytest.raises(ConfigError, match=said) as error:
         plan(load_config(SweepConfig, file), file)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["= word * 2", "= word + word", "= -word", "= 1 + 2j", "= True"])
+def test_words_are_not_counted_with(text):
+    with pytest.raises(ConfigError, match=r"set\.key: got '= .*wanted numbers"):
+        evaluate(text[1:].strip(), {"word": "flight", "flag": True}, "set.key")
+    assert evaluate("word", {"word": "flight"}, "set.key") == "flight"
+
+
+FIGURE = """
+[figure]
+metrics = ["success", "pitch_p95_deg"]
+x = "speed"
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("pitch_p95_deg", "pitch_95_deg",
+         r"figure\.metrics: no metric named 'pitch_95_deg'; did you mean 'pitch_p95_deg'\?"),
+        ("pitch_p95_deg", "field_pitch_p95_deg", r"figure\.metrics: no metric named 'field_pitch"),
+        ("pitch_p95_deg", "plan_ms_median", r"figure\.metrics: no metric named 'plan_ms_median'"),
+        ('x = "speed"', 'x = "sped"', r"figure\.x: no axis named 'sped', there are speed, duty"),
+        ('x = "speed"', 'y = "seed"', r"figure\.y: no axis named 'seed', there are speed, duty"),
+        ('x = "speed"', 'panels = "x"', r"figure\.panels: no axis named 'x'"),
+    ],
+)  # fmt: skip
+def test_a_figure_that_cannot_be_drawn_is_refused_before_anything_walks(file, old, new, said):
+    file.write_text(SWEEP + FIGURE)
+    assert len(plan(load_config(SweepConfig, file), file).cases) == 12
+    file.write_text(SWEEP + FIGURE.replace(old, new))
+    with pytest.raises(ConfigError, match=said) as error:
+        plan(load_config(SweepConfig, file), file)
+    assert "\n" not in str(error.value)
+
+
+def test_the_shipped_sweeps_can_be_planned(repository):
+    for file in sorted((repository / "configs" / "sweeps").glob("*.toml")):
+        assert plan(load_config(SweepConfig, file, {"seeds": 1}), file).cases, file
 
 
 def test_expressions_are_arithmetic():

@@ -1,0 +1,30 @@
+"""Names of metrics are known before anything walks."""
+
+import numpy as np
+import pytest
+
+from kjax.config import RunConfig, load_config
+from kjax.sim.episode import metric_names, metrics
+
+WALL = {"plan_ms_median", "plan_ms_p99", "act_ms_median", "act_ms_p99", "realtime_factor"}
+SWITCH = {"gait.names": ["trot", "bound"], "gait.times": [0.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("keys", "seconds"),
+    [
+        ({}, 3.0),
+        ({"duration": 0.3}, 0.3),
+        ({"command.times": [0.0], "command.velocities": [0.1]}, 3.0),
+        ({"sim.base": "free"}, 3.0),
+        ({"terrain.kind": "paper"}, 3.0),
+        (SWITCH, 3.0),
+        ({**SWITCH, "sim.base": "free", "terrain.kind": "slope", "sim.contacts": "feet"}, 3.0),
+    ],
+)
+def test_the_metrics_of_an_episode_are_those_that_its_config_names(standing_run, keys, seconds):
+    config = load_config(RunConfig, None, {"duration": seconds, **keys})
+    run = standing_run(config, seconds)
+    if len(config.gait.times) > 1:
+        run.gait = np.where(run.time < 1.0, 0, 1)
+    assert set(metrics(run, config)) - WALL == metric_names(config)
