@@ -18,11 +18,11 @@ import jax
 import matplotlib.pyplot as plt
 import mujoco.batch
 import numpy as np
-from mujoco import mjx
 
 from kjax.config import RunConfig, load_config
 from kjax.sim.batch_loop import BatchEngine, dressed
 from kjax.sim.episode import initial_state
+from kjax.sim.mjx_import import mjx
 from kjax.sim.mjx_loop import MjxEngine
 from kjax.sim.mujoco_loop import build_simulation, simulate
 from kjax.sim.observe import resolve

@@ -6,6 +6,7 @@ A user's mistake ends with exit code 2 and one line; nothing here is imported by
 import argparse
 import difflib
 import json
+import multiprocessing
 import os
 import platform
 import subprocess
@@ -202,9 +203,35 @@ def configure_jax(
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        jax.config.update("jax_compilation_cache_dir", str(home / "kjax" / "jax"))
+        folder = compilation_cache()
+        jax.config.update("jax_compilation_cache_dir", None if folder is None else str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def compilation_cache() -> Path | None:
+    """Folder of compiled programs, where it can be written; ``None`` with a note on stderr.
+
+    A container may run as a user that has no name and no home folder. A shared folder such as /tmp
+    is no substitute: what lies there would be executed.
+    """
+    chosen = os.environ.get("XDG_CACHE_HOME")
+    try:
+        folder = (Path(chosen) if chosen else Path.home() / ".cache") / "kjax" / "jax"
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+        reason = f"{folder} cannot be written to"
+    except RuntimeError:
+        reason = "HOME is not set and the user has no entry"
+    except OSError as error:
+        reason = f"{error.filename}: {error.strerror}"
+    if multiprocessing.parent_process() is None:
+        print(
+            f"note: compiled programs are not kept ({reason}); set JAX_COMPILATION_CACHE_DIR to a "
+            "folder of your own",
+            file=sys.stderr,
+        )
+    return None
 
 
 def output_folder(args: argparse.Namespace, default: str) -> Path:

@@ -1,7 +1,9 @@
 import json
+import pwd
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
@@ -79,6 +81,49 @@ def test_a_saved_config_can_be_run_again(tmp_path):
     cli.save_config(path, config)
     assert "git_revision" in path.read_text()
     assert parse(str(path))[0] == config
+
+
+@pytest.fixture
+def homeless(monkeypatch):
+    """A container's user: no HOME, no entry in the list of users."""
+    for name in ("HOME", "XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+
+    def unknown(number):
+        raise KeyError(f"getpwuid(): uid not found: {number}")
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def test_without_a_home_folder_nothing_is_kept_and_a_line_says_so(homeless, capsys):
+    cli.configure_jax()
+    assert jax.config.jax_compilation_cache_dir is None
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert "HOME is not set" in text
+    assert "JAX_COMPILATION_CACHE_DIR" in text
+
+
+def test_without_a_home_folder_a_given_cache_is_used(homeless, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cli.configure_jax()
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "kjax" / "jax")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_home_that_cannot_be_written_to_is_a_line_too(monkeypatch, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))
+    assert cli.compilation_cache() is None
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert str(tmp_path / "file") in text
 
 
 def test_the_core_imports_neither_mujoco_nor_matplotlib():

@@ -15,7 +15,6 @@ import mujoco
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from kjax.config import RunConfig
 from kjax.params import ControllerParams
@@ -35,6 +34,7 @@ from kjax.sim.cases import (
     stack_params,
 )
 from kjax.sim.episode import initial_state
+from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import resolve
 from kjax.sim.push import pushed_body
 from kjax.sim.recording import Recording

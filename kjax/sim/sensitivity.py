@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
-from mujoco import mjx
+
+from kjax.sim.mjx_import import mjx
 
 
 class Sensitivity(NamedTuple):

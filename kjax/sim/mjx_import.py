@@ -1,0 +1,29 @@
+"""MuJoCo's MJX, imported without its note that the optional NVIDIA Warp is not installed.
+
+kjax uses the JAX implementation of MJX. ``mujoco.mjx`` prints to stdout that it found no Warp;
+whatever else it prints, other reasons of a failed import included, comes through.
+"""
+
+import contextlib
+import io
+import sys
+
+# What mujoco.mjx.warp prints where the package is absent, and nothing else.
+_ABSENT = frozenset(
+    f"Failed to import {name}: No module named 'warp'" for name in ("warp", "mujoco_warp")
+)
+
+
+def pass_on(text: str) -> str:
+    """The text without the lines that say that Warp is not installed."""
+    return "".join(line for line in text.splitlines(True) if line.rstrip("\n") not in _ABSENT)
+
+
+said = io.StringIO()
+try:
+    with contextlib.redirect_stdout(said):
+        from mujoco import mjx
+finally:
+    sys.stdout.write(pass_on(said.getvalue()))
+
+__all__ = ["mjx"]
