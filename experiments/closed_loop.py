@@ -1,8 +1,9 @@
 """Run the Go1 under the Koopman LMPC in MuJoCo: one run, or one per seed.
 
 Leaves metrics.json, config.toml, trajectory.npz, figure.png and, if asked for, video.mp4 in the
-output folder. Ctrl-C stops the run and writes what was simulated. With --seeds, runs that are
-already in the folder's seeds.json (same config, same code) are not repeated.
+output folder. Ctrl-C stops the run and writes what was simulated, but no metrics of it, which would
+read like those of a whole run. With --seeds, runs that are already in the folder's seeds.json (same
+config, same code) are not repeated; a folder of another config or other code is refused.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from tqdm import tqdm
 from kjax import cli
 from kjax.config import ConfigError, RunConfig
 from kjax.episodes import Store, code_version, config_hash
-from kjax.sim.episode import Trajectory, metrics
+from kjax.sim.episode import SETTLE_TIME, Trajectory, metrics
 from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
 from kjax.sim.summary import summarise
 
@@ -48,35 +49,55 @@ TABLE = (
 )
 
 
+# What metrics.json holds of a run that was interrupted.
+INTERRUPTED = ("interrupted", "simulated_s", "fell", "fall_time_s")
+
+
 def main() -> None:
     """Parse the command line and run."""
     parser = cli.build_parser(RunConfig, __doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, help="run this many seeds, from config key 'seed' on")
     parser.add_argument("--video", action="store_true", help="also write video.mp4")
     parser.add_argument("--view", action="store_true", help="show the run in MuJoCo's viewer")
+    parser.add_argument("--restart", action="store_true",
+                        help="with --seeds: drop the seeds that the folder holds")  # fmt: skip
     config, args = cli.parse(RunConfig, parser)
     if args.seeds is not None and args.seeds < 1:
         cli.fail(f"--seeds: got {args.seeds}, wanted at least 1")
+    if args.view and args.seeds is not None:
+        cli.fail("--view: shows a single run, leave --seeds out")
+    if args.restart and args.seeds is None:
+        cli.fail("--restart: belongs to --seeds; a single run always starts afresh")
+    if args.view:
+        require_display()
     cli.configure_jax(one_core=True)
     folder = cli.output_folder(args, "closed_loop")
+    store = None if args.seeds is None else open_seeds(config, folder, restart=args.restart)
     clock = time.perf_counter()
     try:
         simulation = build_simulation(config)
     except ConfigError as error:
         cli.fail(str(error))
     print(f"models fitted, controller compiled: {time.perf_counter() - clock:.1f} s", flush=True)
-    if args.seeds is None:
+    if store is None:
         run = _simulate_with_bar(simulation, config, view=args.view)
         result = metrics(run, config)
+        if run.interrupted:
+            print(f"interrupted {_progress(run, config)}: no metrics")
+            result = {key: result[key] for key in INTERRUPTED}
+        else:
+            print_table([result])
+            if config.duration <= SETTLE_TIME:
+                print(f"no metrics: the first {SETTLE_TIME} s, from standing, are left out")
         cli.save_json(folder / "metrics.json", result)
-        print_table([result])
     else:
-        run, config = run_seeds(simulation, config, args.seeds, folder)
+        run, config = run_seeds(simulation, config, args.seeds, store)
     if run is not None:
         save_run(run, config, folder, args)
-    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
     if run is not None and run.interrupted:
+        print(f"what was simulated is in {folder}/")
         raise SystemExit(130)
+    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
 
 
 def save_run(run: Trajectory, config: RunConfig, folder: Path, args: argparse.Namespace) -> None:
@@ -85,7 +106,8 @@ def save_run(run: Trajectory, config: RunConfig, folder: Path, args: argparse.Na
 
     run.save(folder / "trajectory.npz")
     cli.save_config(folder / "config.toml", config)
-    closed_loop_figure(run, config, folder / "figure.png", title=folder.name)
+    title = folder.name + (f", interrupted {_progress(run, config)}" if run.interrupted else "")
+    closed_loop_figure(run, config, folder / "figure.png", title=title)
     if args.video:
         from kjax.viz.video import save_video
 
@@ -113,15 +135,26 @@ def _simulate_with_bar(
         return _simulate_in_viewer(simulation, config, on_tick)
 
 
-def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTick) -> Trajectory:
-    """Run at real-time pace in MuJoCo's passive viewer."""
-    import glfw
-    import mujoco.viewer
+def _progress(run: Trajectory, config: RunConfig) -> str:
+    return f"at {len(run.time) * run.dt:.2f} s of {config.duration:g} s"
 
+
+def require_display() -> None:
+    """End the program where no window can be opened, before anything is compiled."""
+    try:
+        import glfw
+    except ImportError as error:
+        cli.fail(f"--view: no window can be opened here ({error}); try --video")
     # MuJoCo's viewer ends the process where there is no display, so ask first.
     with warnings.catch_warnings(action="ignore"):
         if not glfw.init():
             cli.fail("--view: no window can be opened here (no display?); try --video")
+
+
+def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTick) -> Trajectory:
+    """Run at real-time pace in MuJoCo's passive viewer."""
+    import mujoco.viewer
+
     viewer: Any = None
     begin = time.perf_counter()
 
@@ -147,18 +180,28 @@ def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTi
             viewer.close()
 
 
+def open_seeds(config: RunConfig, folder: Path, *, restart: bool = False) -> Store:
+    """The finished seeds of this config; ends the program where the folder holds others."""
+    path = folder / "seeds.json"
+    if restart:
+        path.unlink(missing_ok=True)
+    plain = dataclasses.replace(config, seed=0, terrain=dataclasses.replace(config.terrain, seed=0))
+    store = Store(path, f"{config_hash(plain)}@{code_version()}", section="seeds")
+    if store.outdated:
+        cli.fail(
+            f"{path} holds seeds of another config or other code: give --out another folder, or "
+            "--restart to drop them"
+        )
+    return store
+
+
 def run_seeds(
-    simulation: Simulation, config: RunConfig, count: int, folder: Path
+    simulation: Simulation, config: RunConfig, count: int, store: Store
 ) -> tuple[Trajectory | None, RunConfig]:
     """Run seeds, each saved as it ends; returns the first run of this call and its config.
 
     Each seed is one of noise and, where there are obstacles, of their field as well.
     """
-    path = folder / "seeds.json"
-    plain = dataclasses.replace(config, seed=0, terrain=dataclasses.replace(config.terrain, seed=0))
-    store = Store(path, f"{config_hash(plain)}@{code_version()}", section="seeds")
-    if store.outdated:
-        print(f"{path}: other config or code; starting afresh")
     done = store.done
     first, first_config = None, config
     for seed in range(config.seed, config.seed + count):
@@ -168,7 +211,8 @@ def run_seeds(
         this = dataclasses.replace(config, seed=seed, terrain=field)
         run = _simulate_with_bar(simulation, this, label=f"seed {seed}")
         if run.interrupted:
-            print(f"stopped in seed {seed}; run the same command again to go on")
+            print(f"interrupted in seed {seed} {_progress(run, this)}; finished seeds are kept, "
+                  "run the same command again to go on")  # fmt: skip
             return run, this
         if first is None:
             first, first_config = run, this

@@ -115,7 +115,7 @@ def draw(sweep: SweepConfig, folder: Path, config: str) -> None:
 
 def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
     """Draw the figure and print what came out, in one line."""
-    from kjax.viz.sweep_plots import success, sweep_figure, sweep_summary
+    from kjax.viz.sweep_plots import sweep_figure, sweep_summary
 
     sweep_figure(dataset, sweep, folder / "figure.png")
     record = {
@@ -123,12 +123,20 @@ def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
         **sweep_summary(dataset, sweep),
     }
     cli.save_json(folder / "summary.json", record)
-    good = success(dataset)
-    print(
-        f"{good.size} episodes, {int(good.sum())} succeeded, "
-        f"{int(dataset['fell'].sum())} fell; median RMSE "
-        f"{float(dataset['velocity_rmse_mps'].where(dataset['fell'] == 0).median()):.4f} m/s"
-    )
+    print(summary_line(dataset))
+
+
+def summary_line(dataset: Any) -> str:
+    """What came out of all episodes, and what counts as a success."""
+    from kjax.viz.sweep_plots import criterion, success
+
+    good, fell = success(dataset), dataset["fell"] > 0
+    text = f"{good.size} episodes, {int(good.sum())} succeeded ({criterion(dataset)}), "
+    text += f"{int(fell.sum())} fell"
+    if "velocity_rmse_mps" in dataset and not bool(fell.all()):
+        median = float(dataset["velocity_rmse_mps"].where(~fell).median())
+        text += f"; median RMSE of the others {median:.4f} m/s"
+    return text
 
 
 if __name__ == "__main__":

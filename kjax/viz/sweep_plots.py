@@ -68,6 +68,7 @@ def sweep_summary(dataset: xr.Dataset, sweep: SweepConfig) -> dict[str, Any]:
     out: dict[str, Any] = {
         "episodes_per_point": int(dataset.sizes["seed"]),
         "dimensions": keep,
+        "success_is": criterion(dataset),
         **{name: dataset[name].values for name in sweep.axes},
     }
     for metric in metrics:
@@ -83,6 +84,11 @@ def success(dataset: xr.Dataset) -> xr.DataArray:
         # A robot that fell has no such entry.
         good = good & (dataset["crossed"].fillna(0) > 0)
     return good
+
+
+def criterion(dataset: xr.Dataset) -> str:
+    """What counts as a success, in words."""
+    return "stayed up and crossed the field" if "crossed" in dataset else "stayed up"
 
 
 def _table(dataset: xr.Dataset, metric: str, keep: list[str], rest: list[str]) -> xr.Dataset:
