@@ -6,10 +6,11 @@ all is there, and repeats what another config or other code would change.
 """
 
 import hashlib
+import itertools
 import json
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from functools import partial
@@ -21,6 +22,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import RunConfig, to_dict
+from kjax.koopman.storage import resolve
 from kjax.sim.episode import Trajectory, fixed_part, metrics
 from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
 
@@ -34,21 +36,46 @@ _HERE = Path(__file__).resolve().parent
 _NO_PHYSICS = ("viz", "sweep", "cli.py", "episodes.py")  # what cannot change an episode
 
 
-def code_version() -> str:
-    """Hash of everything that an episode's result depends on besides its config."""
+def code_version(*files: Path) -> str:
+    """Hash of everything that an episode's result depends on besides its config.
+
+    Args:
+      files: that a result depends on as well, such as a study's own.
+    """
     digest = hashlib.sha256()
     for path in sorted(_HERE.rglob("*")):
         inside = path.relative_to(_HERE)
         if path.suffix in (".py", ".xml") and inside.parts[0] not in _NO_PHYSICS:
             digest.update(inside.as_posix().encode() + path.read_bytes())
+    for file in files:
+        digest.update(file.name.encode() + file.read_bytes())
     for package in ("jax", "mujoco", "numpy"):
         digest.update(version(package).encode())
     return digest.hexdigest()[:16]
 
 
 def config_hash(config: Any) -> str:
-    """Hash of all values of a config."""
-    return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
+    """Hash of all values of a config, and of the content of the files that it names."""
+    values = to_dict(config)
+    text = json.dumps(values, sort_keys=True) + "".join(file_hashes(config).values())
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+# Config keys that name a file whose content a result depends on.
+FILE_KEYS = ("koopman.file",)
+
+
+def file_hashes(config: Any) -> dict[str, str]:
+    """Hash of the content of every file that a config names: key -> hash; of none, "none"."""
+    hashes = {}
+    for key in FILE_KEYS:
+        section, name = key.split(".")
+        file = getattr(getattr(config, section, None), name, "")
+        if file:
+            path = resolve(file)
+            content = path.read_bytes() if path.is_file() else None
+            hashes[key] = "none" if content is None else hashlib.sha256(content).hexdigest()[:16]
+    return hashes
 
 
 class Store:
@@ -57,7 +84,8 @@ class Store:
     Attributes:
       path: of the file.
       done: key -> result.
-      outdated: whether the file held results of another label, which are dropped.
+      outdated: whether the file holds results of another label: they are not in ``done``, and the
+        first result that is added sets the file aside under a name with that label.
     """
 
     def __init__(self, path: Path, label: str, section: str = "episodes"):
@@ -75,13 +103,26 @@ class Store:
                 old = json.loads(path.read_text(encoding="utf-8"))
             except ValueError:
                 cli.fail(f"{path}: not valid JSON; move it away to start afresh")
+            if not isinstance(old, dict) or not isinstance(old.get(section, {}), dict):
+                cli.fail(f"{path}: holds no {section}; move it away to start afresh")
+            self._old_label = str(old.get("label"))
             self.outdated = old.get("label") != label
             if not self.outdated:
-                self.done = old[section]
+                self.done = old.get(section, {})
 
     def add(self, key: str, result: Any, **more: Any) -> None:
         """Keep a result, with further entries of the file beside all results."""
-        self.done[key] = result
+        self.add_all({key: result}, **more)
+
+    def add_all(self, results: Mapping[str, Any], **more: Any) -> None:
+        """Keep several results in one go."""
+        if self.outdated and self.path.exists():
+            old = hashlib.sha256(self._old_label.encode()).hexdigest()[:8]
+            names = (f"{old}{'' if i == 0 else f'-{i}'}" for i in itertools.count())
+            places = (self.path.with_name(f"{self.path.stem}.{name}.json") for name in names)
+            self.path.replace(next(place for place in places if not place.exists()))
+        self.outdated = False
+        self.done |= results
         cli.save_json(
             self.path,
             {
@@ -219,17 +260,18 @@ def _episode_of_call(
 
 _KEPT = 4  # simulations that a process keeps
 _built: dict[RunConfig, Simulation] = {}
+_built_of: dict[RunConfig, dict[str, str]] = {}  # the files that each was built from
 
 
 def _episode(
     config: RunConfig, record: Record | None, path: Path, on_tick: OnTick | None = None
 ) -> dict[str, Any]:
     """Run one episode, in a simulation that is kept for those to come."""
-    fixed = fixed_part(config)
-    if fixed not in _built:
+    fixed, files = fixed_part(config), file_hashes(config)
+    if fixed not in _built or _built_of.get(fixed, {}) != files:
         while len(_built) >= _KEPT:
             del _built[next(iter(_built))]
-        _built[fixed] = build_simulation(config)
+        _built[fixed], _built_of[fixed] = build_simulation(config), files
     run = simulate(_built[fixed], config, on_tick=on_tick)
     if record is not None and not run.interrupted:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from kjax import episodes
-from kjax.config import PushConfig, RunConfig, load_config
+from kjax.config import FitStudyConfig, PushConfig, RunConfig, fields, load_config
+from kjax.koopman import storage
 from kjax.sim.episode import fixed_part, metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate
 
@@ -78,6 +79,96 @@ def test_another_config_is_run_and_other_code_begins_afresh(config, tmp_path):
     other = episodes.Store(path, "other code")
     assert other.outdated
     assert other.done == {}
+
+
+def test_results_of_other_code_are_set_aside_and_not_dropped(tmp_path):
+    path = tmp_path / "episodes.json"
+    for label in ("one", "two", "one", "two"):
+        store = episodes.Store(path, label)
+        assert store.done == {}
+        assert store.outdated == (path.exists())
+        store.add("key", label)
+        assert episodes.Store(path, label).done == {"key": label}
+    kept = sorted(json.loads(file.read_text())["episodes"]["key"] for file in tmp_path.iterdir())
+    assert kept == ["one", "one", "two", "two"]
+
+
+def test_looking_at_results_of_other_code_changes_nothing(tmp_path):
+    path = tmp_path / "episodes.json"
+    episodes.Store(path, "one").add("key", 1)
+    before = path.read_text()
+    assert episodes.Store(path, "two").outdated
+    assert path.read_text() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", '{"label": "code", "episodes": 3}', "{"])
+def test_a_file_that_holds_no_results_is_a_line_and_exit_code_2(tmp_path, capsys, text):
+    path = tmp_path / "episodes.json"
+    path.write_text(text)
+    with pytest.raises(SystemExit) as caught:
+        episodes.Store(path, "code")
+    assert caught.value.code == 2
+    assert str(path) in capsys.readouterr().err
+    assert path.read_text() == text
+
+
+def retrain(path, value):
+    spread = np.full((5, 6), value)
+    return storage.save(path, storage.Stored("residual", 0.005, np.zeros((5, 6, 17)), spread))
+
+
+def with_file(path):
+    return load_config(
+        RunConfig,
+        None,
+        {
+            "koopman.model": "residual",
+            "koopman.file": str(path),
+            "koopman.dataset.dt": 0.005,
+            "lmpc.model_dt": 0.005,
+        },
+    )
+
+
+def test_a_retrained_model_under_the_same_name_is_another_config(tmp_path):
+    config = with_file(tmp_path / "model")  # without .npz, as save and load take it
+    missing = episodes.config_hash(config)
+    retrain(tmp_path / "model", 1e-3)
+    first = episodes.config_hash(config)
+    assert first == episodes.config_hash(config) != missing
+    retrain(tmp_path / "model", 2e-3)
+    assert episodes.config_hash(config) != first
+
+
+def test_a_simulation_is_built_anew_from_a_retrained_model(tmp_path, monkeypatch):
+    built = []
+    monkeypatch.setattr(episodes, "build_simulation", lambda config: built.append(config))
+    monkeypatch.setattr(episodes, "simulate", lambda *a, **k: None)
+    monkeypatch.setattr(episodes, "metrics", lambda *a: {})
+    monkeypatch.setattr(episodes, "_built", {})
+    config = with_file(retrain(tmp_path / "model.npz", 1e-3))
+    for value, count in ((1e-3, 1), (2e-3, 2), (2e-3, 2)):
+        retrain(tmp_path / "model.npz", value)
+        episodes._episode(config, None, tmp_path / "series.npz")
+        assert len(built) == count
+
+
+def test_every_config_key_that_names_a_file_is_hashed_by_content():
+    named = [
+        name for cls in (RunConfig, FitStudyConfig) for name, *_ in fields(cls)
+        if name.rsplit(".", 1)[-1] in ("file", "path") or name.endswith(("_file", "_path"))
+    ]  # fmt: skip
+    assert set(named) == set(episodes.FILE_KEYS)
+
+
+def test_a_study_s_own_file_is_part_of_the_code(tmp_path):
+    file = tmp_path / "study.py"
+    file.write_text("SETS = 3\n")
+    before = episodes.code_version(file)
+    assert before != episodes.code_version()
+    file.write_text("SETS = 4\n")
+    assert episodes.code_version(file) != before
 
 
 def test_a_call_ends_when_enough_is_known(config, tmp_path):

@@ -1,5 +1,6 @@
 """Run a sweep: chunk by chunk, on one process or several, and keep each chunk as it ends."""
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dict
-from kjax.episodes import code_version
+from kjax.episodes import code_version, config_hash
 from kjax.sim.cases import BatchPart, batch_part, check_engine
 from kjax.sweep.grid import plan
 from kjax.sweep.store import Store, columns, lock, restart
@@ -94,6 +95,7 @@ def run_sweep(
         spec = {
             "sweep": to_dict(sweep),
             "base": to_dict(load_config(RunConfig, file.parent / sweep.base)),
+            "cases": _hash_of(cases.cases),
         }
         if process == 0:
             Store(folder, spec, code_version(), len(chunks))
@@ -106,6 +108,12 @@ def run_sweep(
         if process > 0:
             return None
         return store.merge(cases, np.concatenate([chunk.cases for chunk in chunks]), spec)
+
+
+def _hash_of(cases: Sequence[RunConfig]) -> str:
+    """Hash of all cases and of the content of the files that they name."""
+    hashes = {config: config_hash(config) for config in dict.fromkeys(cases)}
+    return hashlib.sha256(" ".join(hashes[c] for c in cases).encode()).hexdigest()[:16]
 
 
 def _run_chunks(

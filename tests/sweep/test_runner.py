@@ -14,9 +14,11 @@ import pytest
 import xarray as xr
 
 from kjax.config import ConfigError, SweepConfig, load_config
+from kjax.koopman import storage
 from kjax.sweep import runner, store
 from kjax.sweep.runner import chunks_of, run_sweep
 from kjax.sweep.store import StoreError
+from kjax.types import Mode
 
 SWEEP = """
 base = "walk.toml"
@@ -122,6 +124,27 @@ def test_another_config_is_refused_with_the_reason(file, tmp_path, calls):
     ):
         walk(file, tmp_path / "out")
     assert walk(file, tmp_path / "out", fresh=True) is not None
+
+
+def test_a_retrained_model_under_the_same_name_is_refused(file, tmp_path, calls):
+    model = tmp_path / "model.npz"
+
+    def train(value):
+        spread = np.full((len(Mode), 6), value)
+        storage.save(model, storage.Stored("residual", 0.005, np.zeros((5, 6, 17)), spread))
+
+    train(1e-3)
+    keys = (
+        f'"koopman.model" = "residual"\n"koopman.file" = "{model}"\n"koopman.dataset.dt" = 0.005\n'
+    )
+    file.write_text(SWEEP + keys + '"lmpc.model_dt" = 0.005\n')
+    walk(file, tmp_path / "out")
+    calls.chunks.clear()
+    walk(file, tmp_path / "out")
+    assert calls.chunks == []
+    train(2e-3)
+    with pytest.raises(StoreError, match="a file that it names, or how its cases are made, has"):
+        walk(file, tmp_path / "out")
 
 
 def test_other_code_is_refused(file, tmp_path, calls, monkeypatch):
