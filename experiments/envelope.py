@@ -1,20 +1,26 @@
-"""How far each gait goes, by bisection: speed, height of blocks, push, slipperiness of the ground.
+"""How far each gait goes: speed, height of blocks, push, slipperiness of the ground.
 
-A value passes if at least 95 % of the seeds stay up and do what was asked: reach the speed within
-20 %, cross the field. Leaves results.json and figure.png in the output folder. Every episode is
-kept there, so the same command goes on after Ctrl-C. The whole takes about 20 minutes per base on
-two cores: a point is 20 episodes of 6 to 10 s, less where two of them have failed already.
+A value passes if at least 95 % of the seeds stay up and do what was asked: walk within 20 % of the
+speed, cross the field. Speed, blocks and friction are bisected; beside a speed that passes stands
+the one that was reached. What a gait bears of a push depends on when it comes, and a harder push
+may pass where a weaker one does not: so pushes are a map over the gait's cycle, and the limit is
+the strongest one up to which every push passes at every phase.
+
+Leaves results.json and figure.png in the output folder. Every episode is kept there, so the same
+command goes on after Ctrl-C. A point is 20 episodes of 6 to 10 s, less where two of them have
+failed already.
 """
 
 import dataclasses
 import json
 import math
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from paper_results import CONFIGS, cycle
 
 from kjax import cli
@@ -24,6 +30,7 @@ from kjax.sim.bisection import bisect
 
 SHARE = 0.95  # of the seeds that must pass
 SPEED = 0.2  # largest relative error of the mean speed
+PUSH_AT = 3.0  # s
 WALK = {"trot": 0.3, "bound": 0.5}  # m/s, speed for pushes and on slippery ground
 
 
@@ -40,8 +47,10 @@ class Axis:
       overrides: of its keys.
       easy: value to begin with.
       hard: value to end with; may be the smaller one.
-      resolution: to bisect to.
-      vary: (value, seed, config) -> overrides of that episode.
+      resolution: to bisect to, or between two values of the map.
+      vary: (value, seed, config), of a map (value, seed, config, phase) with the place in the cycle
+        from 0 to 1 -> overrides of that episode.
+      phases: places in the gait's cycle, evenly spread, of a map; 0 for a bisection.
       wants: "speed" or "crossed" besides not falling, or nothing.
     """
 
@@ -54,7 +63,8 @@ class Axis:
     easy: float
     hard: float
     resolution: float
-    vary: Callable[[float, int, RunConfig], dict[str, Any]]
+    vary: Callable[..., dict[str, Any]]
+    phases: int = 0
     wants: str = ""
 
 
@@ -66,11 +76,10 @@ def _height(value: float, seed: int, config: RunConfig) -> dict[str, Any]:
     return {"terrain.height_min": value, "terrain.height_max": value, "terrain.seed": seed}
 
 
-def _push(value: float, seed: int, config: RunConfig) -> dict[str, Any]:
-    """At 3 s, later by another part of the gait's cycle for every seed (golden ratio)."""
-    place = (seed * (math.sqrt(5.0) - 1.0) / 2.0) % 1.0
-    late = place * cycle(config, config.gait.names[0])
-    return {"push.times": [round(3.0 + late, 3)], "push.forward": value}
+def _push(value: float, seed: int, config: RunConfig, phase: float = 0.0) -> dict[str, Any]:
+    """At 3 s and a part of the gait's cycle."""
+    late = phase * cycle(config, config.gait.names[0])
+    return {"push.times": [round(PUSH_AT + late, 3)], "push.forward": value}
 
 
 def _friction(value: float, seed: int, config: RunConfig) -> dict[str, Any]:
@@ -107,11 +116,11 @@ AXES = (
          config="bound_rough.toml", overrides=_BLOCKS | {"duration": 8.0, "terrain.end": 2.4},
          easy=0.01, hard=0.17, resolution=0.01, vary=_height, wants="crossed"),
     Axis(name="push_trot", title="trot", quantity="strongest forward push", unit="N s",
-         config=_TROT, overrides=_steady(WALK["trot"], 6.0), easy=1.0, hard=65.0, resolution=1.0,
-         vary=_push),
+         config=_TROT, overrides=_steady(WALK["trot"], 6.0), easy=2.5, hard=40.0, resolution=2.5,
+         vary=_push, phases=7),
     Axis(name="push_bound", title="bound", quantity="strongest forward push", unit="N s",
-         config=_BOUND, overrides=_steady(WALK["bound"], 6.0), easy=1.0, hard=65.0,
-         resolution=1.0, vary=_push),
+         config=_BOUND, overrides=_steady(WALK["bound"], 6.0), easy=2.5, hard=40.0,
+         resolution=2.5, vary=_push, phases=7),
     Axis(name="friction_trot", title="trot", quantity="slipperiest ground, friction", unit="-",
          config=_TROT, overrides=_steady(WALK["trot"], 8.0), easy=0.8, hard=0.05,
          resolution=0.025, vary=_friction, wants="speed"),
@@ -127,10 +136,10 @@ def main() -> None:
     args = _parse()
     folder = cli.output_folder(args, "envelope")
     cli.configure_jax(one_core=args.jobs == 1)
-    code = code_version()
-    store = Store(folder / "episodes.json", code)
+    code = code_version(Path(__file__))
+    store = Store(folder / "episodes.json", code_version())
     if store.outdated:
-        print(f"{folder}: the code has changed since; starting afresh")
+        print(f"{folder}: the code has changed since; starting afresh, what it holds is set aside")
     found = _kept(folder / "results.json", code, args)
     try:
         with open_runner(store, jobs=args.jobs) as run:
@@ -181,42 +190,93 @@ def _config(axis: Axis, base: str, args: Namespace) -> RunConfig:
 
 
 def _search(axis: Axis, base: str, args: Namespace, run: Run) -> dict[str, Any]:
-    """Bisect one axis; the bracket and every point that was probed."""
+    """Bracket of one axis, and every point that was probed."""
     config = _config(axis, base, args)
     seeds = min(args.seeds, 2) if args.quick else args.seeds
-    allowed = math.floor((1.0 - SHARE) * seeds + 1e-9)
+    resolution = abs(axis.hard - axis.easy) / 2.0 if args.quick else axis.resolution
     probed: list[dict[str, Any]] = []
 
-    def passes(value: float) -> bool:
-        chosen = [_changed(config, axis.vary(value, seed, config), seed) for seed in range(seeds)]
+    def passes(value: float, phase: float | None = None) -> bool:
+        point = _point(axis, base, config, value, phase, seeds, run)
+        probed.append(point)
+        return bool(point["passed"])
 
-        def hopeless(results: list[dict[str, Any]]) -> bool:
-            return sum(not _passed(axis, value, result) for result in results) > allowed
-
-        label = f"{axis.name} ({base}) {value:.3g} {axis.unit}"
-        results = [r for r in run(chosen, label=label, enough=hopeless) if r is not None]
-        failures = sum(not _passed(axis, value, result) for result in results)
-        falls = sum(result["fell"] for result in results)
-        probed.append(
-            {"value": value, "run": len(results), "failures": failures, "falls": falls,
-             "passed": failures <= allowed}
-        )  # fmt: skip
-        return failures <= allowed
-
-    resolution = abs(axis.hard - axis.easy) / 2.0 if args.quick else axis.resolution
-    bracket = bisect(passes, axis.easy, axis.hard, resolution)
+    if axis.phases:
+        count = 2 if args.quick else axis.phases
+        found = _map(passes, axis, resolution, [i / count for i in range(count)])
+        length = cycle(config, config.gait.names[0])
+        for one in found["phases"]:
+            one["late_s"] = round(one["phase"] * length, 3)
+    else:
+        found = bisect(passes, axis.easy, axis.hard, resolution)._asdict()
+    at_limit = [p for p in probed if p["value"] == found["passed"]]
     return {
         "title": f"{axis.title}, {base}",
         "quantity": axis.quantity,
         "unit": axis.unit,
         "easy": axis.easy,
-        "passed": bracket.passed,
-        "failed": bracket.failed,
+        **found,
+        "reached_mps": at_limit[0]["reached_mps"] if axis.wants == "speed" and at_limit else None,
         "resolution": resolution,
         "seeds": seeds,
         "config": config_hash(config),
         "probed": probed,
     }
+
+
+def _point(
+    axis: Axis, base: str, config: RunConfig, value: float, phase: float | None, seeds: int,
+    run: Run,
+) -> dict[str, Any]:  # fmt: skip
+    """Episodes of all seeds at a value, fewer where too many have failed already."""
+    where = () if phase is None else (phase,)
+    allowed = math.floor((1.0 - SHARE) * seeds + 1e-9)
+    chosen = [_changed(config, axis.vary(value, s, config, *where), s) for s in range(seeds)]
+
+    def hopeless(results: list[dict[str, Any]]) -> bool:
+        return sum(not _passed(axis, value, result) for result in results) > allowed
+
+    label = f"{axis.name} ({base}) {value:.3g} {axis.unit}"
+    label += "" if phase is None else f" at {phase:.2f} of the cycle"
+    results = [r for r in run(chosen, label=label, enough=hopeless) if r is not None]
+    failures = sum(not _passed(axis, value, result) for result in results)
+    speeds = [r["velocity_late_mean_mps"] for r in results
+              if not r["fell"] and "velocity_late_mean_mps" in r]  # fmt: skip
+    return {
+        "value": value,
+        **({} if phase is None else {"phase": phase}),
+        "run": len(results),
+        "failures": failures,
+        "falls": sum(result["fell"] for result in results),
+        "reached_mps": float(np.median(speeds)) if speeds else None,
+        "passed": failures <= allowed,
+    }
+
+
+def _map(
+    passes: Callable[[float, float], bool], axis: Axis, resolution: float, phases: Sequence[float]
+) -> dict[str, Any]:
+    """At each phase the values from the easy end on until one fails; the weakest phase counts.
+
+    Returns:
+      ``passed``, up to which every value passes at every phase (``None`` if not even the first
+      does), ``failed``, the first one that fails at some phase (``None`` if none does), and the
+      same of each phase.
+    """
+    steps = round(abs(axis.hard - axis.easy) / resolution)
+    values = [float(v) for v in np.linspace(axis.easy, axis.hard, steps + 1)]
+    found = []
+    for phase in phases:
+        good = 0
+        while good < len(values) and passes(values[good], phase):
+            good += 1
+        found.append(
+            {"phase": phase, "passed": values[good - 1] if good else None,
+             "failed": values[good] if good < len(values) else None}
+        )  # fmt: skip
+    weakest = min(found, key=lambda one: len(values) if one["failed"] is None
+                  else values.index(one["failed"]))  # fmt: skip
+    return {"passed": weakest["passed"], "failed": weakest["failed"], "phases": found}
 
 
 def _changed(config: RunConfig, overrides: dict[str, Any], seed: int) -> RunConfig:
@@ -244,11 +304,22 @@ def _passed(axis: Axis, value: float, result: dict[str, Any]) -> bool:
 
 
 def _shown(one: dict[str, Any]) -> str:
+    """The bracket in words."""
+    unit, phases = one["unit"], one.get("phases")
+    everywhere = " at every phase" if phases else ""
     if one["passed"] is None:
-        return f"fails at {one['easy']:.3g} {one['unit']} already"
-    limit = f"{one['passed']:.3g} {one['unit']} passes"
-    return limit + (", the end of the search" if one["failed"] is None
-                    else f", {one['failed']:.3g} does not")  # fmt: skip
+        return f"fails at {one['easy']:.3g} {unit} already" + (" at some phase" if phases else "")
+    limit = f"{one['passed']:.3g} {unit} passes{everywhere}"
+    if one.get("reached_mps") is not None:
+        limit += f" (the speed reached is {one['reached_mps']:.3g} m/s)"
+    if one["failed"] is None:
+        limit += ", the end of the search"
+    else:
+        limit += f", {one['failed']:.3g} does not"
+    if phases:
+        each = ", ".join("none" if p["passed"] is None else f"{p['passed']:.3g}" for p in phases)
+        limit += f"; from phase to phase: {each}"
+    return limit
 
 
 def _save(folder: Path, found: dict[str, Any], code: str, args: Namespace) -> None:

@@ -146,7 +146,8 @@ def envelope_figure(axes_found: Mapping[str, Mapping[str, Any]], path: Path) -> 
     """One panel per quantity: a dot at the hardest value that passed, a bar to the first failure.
 
     Args:
-      axes_found: name -> ``title``, ``quantity``, ``unit``, ``easy``, ``passed`` and ``failed``.
+      axes_found: name -> ``title``, ``quantity``, ``unit``, ``easy``, ``passed`` and ``failed``;
+        where there are any ``reached_mps``, and ``phases`` with limits of their own.
       path: image file to write.
     """
     panels: dict[str, list[Mapping[str, Any]]] = {}
@@ -165,13 +166,15 @@ def envelope_figure(axes_found: Mapping[str, Mapping[str, Any]], path: Path) -> 
             axis.set_ylim(len(rows) - 0.4, -0.6)
             axis.set_xlim(left=0.0)
             axis.set_xlabel(quantity)
-        fig.suptitle("dot: passed; bar: up to what failed; triangle: the end of the search passed",
-                     fontsize=8)  # fmt: skip
+        fig.suptitle("dot: passed; bar: up to what failed; triangle: the end of the search passed; "
+                     "stroke: limit of a phase", fontsize=8)  # fmt: skip
         _finish(fig, path)
 
 
 def _bracket(axis: Axes, y: int, one: Mapping[str, Any]) -> None:
     passed, failed = one["passed"], one["failed"]
+    own = [phase["passed"] for phase in one.get("phases", ()) if phase["passed"] is not None]
+    axis.plot(own, [y] * len(own), "|", color=DARK, ms=9)
     if passed is None:
         axis.plot(one["easy"], y, "x", color=RED)
         axis.annotate("fails", (one["easy"], y), (6, -3), textcoords="offset points")
@@ -179,7 +182,9 @@ def _bracket(axis: Axes, y: int, one: Mapping[str, Any]) -> None:
     if failed is not None:
         axis.plot([passed, failed], [y, y], color=GREY, lw=4, solid_capstyle="butt")
     axis.plot(passed, y, "o" if failed is not None else ">", color=BLUE)
-    axis.annotate(f"{passed:.3g}", (passed, y), (0, 5), textcoords="offset points", ha="center")
+    reached = one.get("reached_mps") if one["unit"] == "m/s" else None
+    text = f"{passed:.3g}" + ("" if reached is None else f", reached {reached:.3g}")
+    axis.annotate(text, (passed, y), (0, 5), textcoords="offset points", ha="center")
 
 
 def write_page(
