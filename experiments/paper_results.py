@@ -67,6 +67,7 @@ _REPORTED = (
     Row(metric="torque_saturation_fraction", label="time with a saturated joint [-]"),
     Row(metric="body_contact_fraction", label="time with another body on the ground [-]"),
 )
+_REPORTED_ROUGH = _REPORTED[:2]  # the batch engine does not see which bodies touch the ground
 _NO_FALL = Row(metric="falls", label="falls", target=0)
 
 EXPERIMENTS = (
@@ -162,7 +163,7 @@ EXPERIMENTS = (
             Row(metric=RMSE, label="RMSE against the raw step [m/s]"),
             Row(metric="velocity_reference_rmse_mps", label="RMSE, slewed reference [m/s]"),
             Row(metric="velocity_late_rmse_mps", label="RMSE from 2 s after the step [m/s]"),
-            *_REPORTED,
+            *_REPORTED_ROUGH,
         ),
     ),
     Experiment(
@@ -181,7 +182,7 @@ EXPERIMENTS = (
             ),
             Row(metric="velocity_late_rmse_mps", label="RMSE from 2 s after the step [m/s]"),
             Row(metric="field_pitch_p95_deg", label="pitch in the field, 95 % [deg]"),
-            *_REPORTED,
+            *_REPORTED_ROUGH,
         ),
     ),
     Experiment(

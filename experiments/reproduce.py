@@ -1,22 +1,30 @@
 """Run everything that the paper publishes and set it beside its numbers and our targets.
 
 Leaves results.json, table.md, index.html and figures/ in the output folder. Every finished episode
-is kept there: the same command goes on after Ctrl-C, and does nothing when all is done. Both bases
-take about 40 minutes on two quiet cores; experiments/paper_results.py says what is run.
+is kept there: the same command goes on after Ctrl-C, and does nothing when all is done. Rough
+ground is walked by the batch engine, on the same fields with torques at every physics step and with
+torques held over a control tick. Both bases take about an hour on two quiet cores;
+experiments/paper_results.py says what is run.
 """
 
 import json
 from argparse import Namespace
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import koopman_fit
+import numpy as np
+import paper_results
 from koopman_fit import fit_study, save_figure
 from paper_results import CONFIGS, EXPERIMENTS, RMSE, Experiment, Row, base_config, cycle, episodes
 
 from kjax import cli
+from kjax.batches import batch_key, run_batch
 from kjax.config import ConfigError, FitStudyConfig, load_config
 from kjax.episodes import Run, Store, code_version, config_hash, open_runner
+from kjax.sim.intervals import median_interval, paired_difference, wilson
 from kjax.sim.series import Series, load_series, save_series
 from kjax.sim.summary import summarise, tracking_floor
 
@@ -24,8 +32,21 @@ FIT = "koopman_fit"
 NAMES = (FIT, *(experiment.name for experiment in EXPERIMENTS))
 GRAVITY = 9.81  # m/s^2
 ACCELERATION = 4.0  # m/s^2, of the floor of the tracking error, beside mu g
-HEADER = ("experiment", "base", "", "paper", "target", "median", "worst", "floor", "met")
+SHOWN = 64  # fields whose episodes are drawn
+# What holding the torques over a control tick costs, beside fields crossed: metric and label.
+HELD = (
+    (RMSE, "RMSE against the raw step, more by holding [m/s]"),
+    ("field_pitch_p95_deg", "pitch in the field, 95 %, more by holding [deg]"),
+)
+HEADER = (
+    "experiment", "base", "", "paper", "target", "median", "95 % interval", "worst", "floor", "met"
+)  # fmt: skip
 NOTES = (
+    "Intervals hold with 95 %: Wilson's for numbers of episodes, that of the order statistics for "
+    "medians, Newcombe's for the difference of two shares on the same fields.",
+    "Torques are computed at every physics step, as on the robot. The rows on holding them repeat "
+    "the same fields with torques held over a control tick; differences are of the fields on which "
+    "the robot stayed up both ways.",
     "Median and worst are over the episodes that did not fall; falls are counted apart. The "
     "target is for the number in the column that it stands beside: median, or worst where it says "
     "so.",
@@ -43,18 +64,21 @@ def main() -> None:
     cli.configure_jax(one_core=args.jobs == 1)
     chosen = [experiment for experiment in EXPERIMENTS if experiment.name in args.only]
     (folder / "figures").mkdir(exist_ok=True)
-    code = code_version()
+    code = code_version(Path(__file__), Path(paper_results.__file__))
     before = _read(folder / "results.json")
     record: dict[str, Any] = {
         "provenance": cli.provenance(), "code": code, "quick": args.quick, "experiments": {}
     }  # fmt: skip
     if before and before.get("code") != code:
-        print(f"{folder}: the code has changed since; everything is run again")
+        print(f"{folder}: the code has changed since; the table is made again")
     elif before:  # what is not asked for now stays on the page
         record["experiments"] = _kept(before, args)
     if FIT in args.only:
-        record["experiments"][FIT] = _fit(folder, code, quick=args.quick)
-    store = Store(folder / "episodes.json", code)
+        record["experiments"][FIT] = _fit(folder, quick=args.quick)
+    store = Store(folder / "episodes.json", code_version())
+    if store.outdated:
+        print(f"{folder}: the simulated code has changed since; all episodes are run again, those "
+              "that it holds are set aside")  # fmt: skip
     try:
         with open_runner(store, jobs=args.jobs, record=save_series) as run:
             for experiment in chosen:
@@ -78,7 +102,7 @@ def _parse() -> Namespace:
         NAMES,
         counts={
             "seeds": (16, "episodes on flat ground"),
-            "terrains": (64, "episodes on rough ground"),
+            "terrains": (256, "episodes on rough ground"),
         },
         base="both",
         quick="2 episodes of 1.5 s each: to check the script",
@@ -111,11 +135,11 @@ def _read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
-def _fit(folder: Path, code: str, *, quick: bool) -> dict[str, Any]:
+def _fit(folder: Path, *, quick: bool) -> dict[str, Any]:
     """The fit study of Fig. 3; its statistics and the hash of what they came from."""
     overrides = {"scales": [1.0], "test_states": 5, "test_profiles": 5} if quick else {}
     config = load_config(FitStudyConfig, CONFIGS / "koopman_fit.toml", overrides)
-    store = Store(folder / "fit.json", code, section="fits")
+    store = Store(folder / "fit.json", code_version(Path(koopman_fit.__file__)), section="fits")
     key, figure = config_hash(config), folder / "figures" / f"{FIT}.png"
     if key not in store.done or not figure.exists():
         print(f"{FIT}: fitting", flush=True)
@@ -131,37 +155,98 @@ def _measure(
     """Run what is missing of an experiment on a base; its summary and the rows of the table."""
     config = base_config(experiment, base, quick=args.quick)
     chosen = episodes(experiment, config, seeds=args.seeds, terrains=args.terrains)
-    results = run(chosen, label=f"{experiment.name} ({base})")
-    total = summarise(result for result in results if result is not None)
+    label, more = f"{experiment.name} ({base})", {}
+    if experiment.vary == "terrain":
+        walk = partial(run_batch, store, chosen, threads=args.jobs)
+        results = walk(torques="every_step", record=save_series, recorded=SHOWN, label=label)
+        held = walk(torques="held", label=f"{label}, torques held")
+        more["held"] = {"summary": summarise(held), "cost": held_cost(results, held)}
+        shown = [batch_key(one, "every_step") for one in chosen[:SHOWN]]
+    else:
+        results = [result for result in run(chosen, label=label) if result is not None]
+        shown = [config_hash(one) for one in chosen]
+    total = summarise(results)
     floors = {
         name: tracking_floor(config.command, a, end=config.duration)
         for name, a in (("4_mps2", ACCELERATION), ("mu_g", config.sim.friction * GRAVITY))
     }
-    rows = [_row(row, total, floors) for row in experiment.rows]
+    rows = [_row(row, total, floors, results) for row in experiment.rows]
     return {
         "config": config_hash(config),
-        "episodes": [config_hash(one) for one in chosen],
+        "episodes": shown,
         "summary": total,
         "floor_rmse_mps": floors,
         "rows": rows,
+        **more,
     }
 
 
-def _row(row: Row, total: dict[str, Any], floors: dict[str, float]) -> dict[str, Any]:
-    """One number: the paper's, the target, ours, the floor, and whether the target is met."""
+def held_cost(
+    every_step: Sequence[dict[str, Any]], held: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """What torques held over a tick cost, on the same fields.
+
+    Args:
+      every_step: metrics of each field with torques at every physics step.
+      held: the same fields in the same order with torques held.
+
+    Returns:
+      ``crossed``: fields crossed both ways, fields lost and gained by holding, the difference of
+      the shares and its interval; and for each metric of ``HELD`` the median of what it is more,
+      with its interval, over the fields on which the robot stayed up both ways.
+    """
+    one, two = ([bool(row.get("crossed")) for row in rows] for rows in (every_step, held))
+    difference, low, high = paired_difference(one, two)
+    out: dict[str, Any] = {
+        "crossed": {
+            "fields": len(one), "every_step": sum(one), "held": sum(two),
+            "lost": sum(a and not b for a, b in zip(one, two, strict=True)),
+            "gained": sum(b and not a for a, b in zip(one, two, strict=True)),
+            "difference": difference, "low": low, "high": high,
+        }
+    }  # fmt: skip
+    for metric, _ in HELD:
+        more = [
+            b[metric] - a[metric]
+            for a, b in zip(every_step, held, strict=True)
+            if not a["fell"] and not b["fell"]
+            and a.get(metric) is not None and b.get(metric) is not None
+        ]  # fmt: skip
+        low_high = median_interval(more) or (None, None)
+        out[metric] = {
+            "n": len(more), "median": float(np.median(more)) if more else None,
+            "low": low_high[0], "high": low_high[1],
+        }  # fmt: skip
+    return out
+
+
+def _row(
+    row: Row,
+    total: dict[str, Any],
+    floors: dict[str, float],
+    results: Sequence[dict[str, Any]] = (),
+) -> dict[str, Any]:
+    """One number: the paper's, the target, ours, its interval, the floor, whether it is met."""
+    interval: tuple[float, float] | None = None
     if row.metric == "falls":
         median = worst = total["falls"]
+        interval = wilson(median, total["runs"])
     elif row.metric == "crossed":
         median = worst = total.get("crossed", 0) / total["runs"]
+        interval = wilson(total.get("crossed", 0), total["runs"])
     else:
         median, worst = (total.get(row.metric, {}).get(key) for key in ("median", "worst"))
+        interval = median_interval(
+            [r[row.metric] for r in results if not r["fell"] and r.get(row.metric) is not None]
+        )
     ours, met = (median if row.of == "median" else worst), None
     if row.target is not None:
         above = row.metric == "crossed"
         met = ours is not None and (ours >= row.target if above else abs(ours) <= row.target)
+    low, high = interval or (None, None)
     return {
         "metric": row.metric, "label": row.label, "paper": row.paper, "target": row.target,
-        "target_of": row.of, "median": median, "worst": worst, "met": met,
+        "target_of": row.of, "median": median, "low": low, "high": high, "worst": worst, "met": met,
         "floor": list(floors.values()) if row.metric == RMSE else None,
     }  # fmt: skip
 
@@ -189,7 +274,7 @@ def _table(experiments: dict[str, Any]) -> list[list[str]]:
             ours = ", ".join(f"{mode} {best[key] or 'none'}" for mode, best in found.items())
             rows.append(
                 [f"fit: part of the sampled ranges with the {key} within 1e-4 after 50 ms", "SRB",
-                 key, "error within 1e-4, ranges not given", "", ours, "", "", ""]
+                 key, "error within 1e-4, ranges not given", "", ours, "", "", "", ""]
             )  # fmt: skip
     for experiment in EXPERIMENTS:
         for base, one in experiments.get(experiment.name, {}).items():
@@ -201,9 +286,36 @@ def _table(experiments: dict[str, Any]) -> list[list[str]]:
                 rows.append(
                     [experiment.title, base, row["label"], row["paper"], _target(row),
                      _count(row, count) if whole else _number(row["median"]),
+                     _interval(row, percent=whole),
                      "" if whole else _number(row["worst"]), floor, met]
                 )  # fmt: skip
+            if "held" in one:
+                rows += _held_rows(experiment.title, base, one["held"]["cost"])
     return rows
+
+
+def _held_rows(title: str, base: str, cost: dict[str, Any]) -> list[list[str]]:
+    """What holding the torques costs: fields crossed, lost and gained, speed, pitch."""
+    crossed = cost["crossed"]
+    name = f"{title}, torques held"
+    shown = [
+        ("terrains crossed", f"{crossed['held']} of {crossed['fields']}",
+         _interval(dict(zip(("low", "high"), wilson(crossed["held"], crossed["fields"]),
+                            strict=True)), percent=True)),
+        (f"the same terrains, more by holding [%]: {crossed['lost']} lost, {crossed['gained']} "
+         "gained", f"{100 * crossed['difference']:+.1f}", _interval(crossed, percent=True)),
+        *((label, _number(cost[metric]["median"]), _interval(cost[metric]))
+          for metric, label in HELD),
+    ]  # fmt: skip
+    return [[name, base, label, "", "", value, ends, "", "", ""] for label, value, ends in shown]
+
+
+def _interval(row: dict[str, Any], *, percent: bool = False) -> str:
+    """Ends of an interval; of a share in percent."""
+    low, high = row.get("low"), row.get("high")
+    if low is None or high is None:
+        return ""
+    return f"{100 * low:.1f} to {100 * high:.1f} %" if percent else f"{low:.3g} to {high:.3g}"
 
 
 def _target(row: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ from argparse import Namespace
 import pytest
 
 from kjax.gait import bound
+from kjax.sim.cases import batch_part
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,63 @@ def test_a_target_is_met_by_the_number_that_it_is_for(experiments):
     assert not met(metric="falls", target=0)
     assert met(metric="crossed", target=0.8)
     assert not met(metric="crossed", target=0.9)
+
+
+def field(crossed, rmse=0.1, fell=False):
+    if fell:
+        return {"fell": True, "crossed": False}
+    return {
+        "fell": False, "crossed": crossed, "velocity_rmse_mps": rmse, "field_pitch_p95_deg": None
+    }  # fmt: skip
+
+
+def test_the_cost_of_held_torques_is_counted_field_by_field(experiments):
+    every = [*[field(True)] * 16, field(False), field(True, fell=True)]
+    held = [*[field(True, 0.12)] * 14, field(False, 0.2), field(False, fell=True),
+            field(True, 0.1), field(True, 0.1)]  # fmt: skip
+    cost = experiments.reproduce.held_cost(every, held)
+    crossed = cost["crossed"]
+    assert (crossed["every_step"], crossed["held"], crossed["fields"]) == (16, 16, 18)
+    assert (crossed["lost"], crossed["gained"]) == (2, 2)
+    assert crossed["difference"] == 0.0
+    assert crossed["low"] < 0.0 < crossed["high"]
+    # 16 fields are stood up on both ways: 14 by 0.02, one by 0.1, one by nothing.
+    rmse = cost["velocity_rmse_mps"]
+    assert rmse["n"] == 16
+    assert (rmse["median"], rmse["low"], rmse["high"]) == pytest.approx((0.02, 0.02, 0.02))
+    assert cost["field_pitch_p95_deg"] == {"n": 0, "median": None, "low": None, "high": None}
+    rows = experiments.reproduce._held_rows("rough", "free", cost)
+    assert all(len(row) == len(experiments.reproduce.HEADER) for row in rows)
+    assert rows[0][5:7] == ["16 of 18", "67.2 to 96.9 %"]  # Wilson's, by hand
+    assert "2 lost, 2 gained" in rows[1][2]
+
+
+def test_numbers_stand_beside_their_intervals(experiments):
+    row, judge = experiments.paper_results.Row, experiments.reproduce._row
+    results = [{"fell": i == 0, "a": float(i)} for i in range(17)]
+    total = {"runs": 17, "falls": 1, "crossed": 16, "a": {"median": 8.5, "worst": 16.0, "n": 16}}
+    own = judge(row(metric="a", label=""), total, {}, results)
+    assert (own["low"], own["high"]) == (4.0, 13.0)  # ranks 4 and 13 of 16, from a table
+    falls = judge(row(metric="falls", label=""), total, {}, results)
+    assert (falls["low"], falls["high"]) == pytest.approx((0.0105, 0.2698), abs=1e-4)
+    few = judge(row(metric="a", label=""), total, {}, results[:4])
+    assert (few["low"], few["high"]) == (None, None)
+    assert experiments.reproduce._interval(few) == ""
+    assert experiments.reproduce._interval(falls, percent=True) == "1.0 to 27.0 %"
+
+
+def test_rough_ground_is_walked_on_256_fields(experiments, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["reproduce"])
+    args = experiments.reproduce._parse()
+    rough = [e for e in experiments.paper_results.EXPERIMENTS if e.vary == "terrain"]
+    assert {e.name for e in rough} == {"trot_rough", "bound_rough"}
+    for experiment in rough:
+        config = experiments.paper_results.base_config(experiment, "free", quick=False)
+        chosen = experiments.paper_results.episodes(
+            experiment, config, seeds=args.seeds, terrains=args.terrains
+        )
+        assert len({one.terrain.seed for one in chosen}) == 256
+        assert len({batch_part(one) for one in chosen}) == 1  # one batch takes them all
 
 
 def test_an_episode_passes_if_it_did_what_was_asked(experiments):
@@ -232,10 +290,13 @@ def test_a_quick_reproduction_leaves_page_table_and_json_and_goes_on(
     one = record["experiments"]["trot_rough"]["planar"]
     assert one["summary"]["runs"] == 2
     assert one["rows"][0]["target"] == 0.98
+    assert one["held"]["cost"]["crossed"]["fields"] == 2
+    assert len(json.loads((tmp_path / "episodes.json").read_text())["episodes"]) == 4
     page = (tmp_path / "index.html").read_text()
     assert "figures/trot_rough_planar.png" in page
     assert (tmp_path / "figures" / "trot_rough_planar.png").exists()
     assert "rough trot" in (tmp_path / "table.md").read_text()
+    assert "rough trot, 0.3 m/s, torques held" in (tmp_path / "table.md").read_text()
 
     episodes = (tmp_path / "episodes.json").read_text()
     experiments.reproduce.main()
