@@ -2,14 +2,16 @@
 
 For each gait and model the same number of random weight sets is tried on tuning seeds, and the best
 one reports on other seeds, beside the config's own weights. Leaves metrics.json, table.md and
-figure.png in the output folder. Every model is kept as it ends: the same command goes on.
+figure.png in the output folder. Every model is kept as it ends: the same command goes on. A folder
+of other code, or of a model that would walk other episodes now, is refused.
 """
 
 import dataclasses
+import hashlib
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,7 +19,7 @@ from prediction_models import MODELS, residual
 
 from kjax import cli
 from kjax.config import RunConfig, load_config
-from kjax.episodes import code_version
+from kjax.episodes import code_version, config_hash
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
@@ -46,25 +48,35 @@ def main() -> None:
     cli.configure_jax()
     path, clock = folder / "walks.json", time.perf_counter()
     there = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if there and there["code"] != code_version():
+    code = code_version(Path(__file__))
+    if there and there["code"] != code:
         cli.fail(f"{path} holds walks of other code or versions: give --out another folder")
     walks = there.get("walks", {})
-    for gait in args.gaits:
-        models = models_of(gait, args)
-        for name, keys in models.items():
-            label = f"{gait}, {name}" + (", quick" if args.quick else "")
-            if label in walks:
-                continue
-            try:
-                walks[label] = {"gait": gait, "model": name, **walk(gait, keys, args.quick)}
-            except KeyboardInterrupt:
-                print(f"interrupted; finished models are kept in {folder}/, run again to go on")
-                raise SystemExit(130) from None
-            cli.save_json(path, {"code": code_version(), "walks": walks})
-            tuned = walks[label]["tuned"]
-            print(f"{label}: rmse {tuned['rmse_median']:.4f} m/s, {tuned['falls']} of "
-                  f"{tuned['episodes']} fell, tuned on {walks[label]['sets']} sets "
-                  f"({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
+    studies = {
+        f"{gait}, {name}" + (", quick" if args.quick else ""): Study(gait, name, keys, args.quick)
+        for gait in args.gaits
+        for name, keys in models_of(gait, args).items()
+    }
+    identities = {label: identity(study) for label, study in studies.items()}
+    for label, own in identities.items():
+        if label in walks and walks[label].get("identity") != own:
+            cli.fail(f"{path}: '{label}' would walk other episodes now (its keys, the lists or its "
+                     "file have changed): give --out another folder")  # fmt: skip
+    for label, study in studies.items():
+        if label in walks:
+            continue
+        try:
+            walked = walk(study)
+        except KeyboardInterrupt:
+            print(f"interrupted; finished models are kept in {folder}/, run again to go on")
+            raise SystemExit(130) from None
+        named = {"gait": study.gait, "model": study.name, "identity": identities[label]}
+        walks[label] = {**named, **walked}
+        cli.save_json(path, {"code": code, "walks": walks})
+        tuned = walks[label]["tuned"]
+        print(f"{label}: rmse {tuned['rmse_median']:.4f} m/s, {tuned['falls']} of "
+              f"{tuned['episodes']} fell, tuned on {walks[label]['sets']} sets "
+              f"({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
     text = table(walks)
     (folder / "table.md").write_text(text, encoding="utf-8")
     figure(walks, folder / "figure.png")
@@ -86,18 +98,49 @@ def models_of(gait: str, args: Any) -> dict[str, dict[str, Any]]:
     return models
 
 
-def walk(gait: str, keys: dict[str, Any], quick: bool) -> dict[str, Any]:
+class Study(NamedTuple):
+    """A gait with a model.
+
+    Attributes:
+      gait: key of ``GAITS``.
+      name: of the model, in tables.
+      keys: config keys of the model.
+      quick: whether few sets and seeds will do.
+    """
+
+    gait: str
+    name: str
+    keys: dict[str, Any]
+    quick: bool
+
+    @property
+    def sizes(self) -> tuple[int, list[int], list[int]]:
+        """Number of weight sets, tuning seeds, reporting seeds."""
+        sets, tune, report = SETS, list(TUNE_SEEDS), list(REPORT_SEEDS)
+        return (3, tune[:1], report[:2]) if self.quick else (sets, tune, report)
+
+
+def candidates(study: Study) -> list[RunConfig]:
+    """Configs with each set of weights; the first one has the config's own."""
+    base = config_of(study.gait, study.keys)
+    return [scaled(base, study.gait, row) for row in weight_scales(study.sizes[0])]
+
+
+def identity(study: Study) -> str:
+    """Hash of all that decides which episodes are walked, the content of model files included."""
+    _, tune, report = study.sizes
+    text = json.dumps([[config_hash(c) for c in candidates(study)], tune, report])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def walk(study: Study) -> dict[str, Any]:
     """Tune the weights of a model, then report them and the config's own on other seeds."""
-    sets, tune, report = SETS, list(TUNE_SEEDS), list(REPORT_SEEDS)
-    if quick:
-        sets, tune, report = 3, tune[:1], report[:2]
-    base = config_of(gait, keys)
-    scales = weight_scales(sets)
-    candidates = [scaled(base, gait, row) for row in scales]
-    rows = run([dataclasses.replace(c, seed=s) for c in candidates for s in tune])
+    sets, tune, report = study.sizes
+    scales, chosen = weight_scales(sets), candidates(study)
+    rows = run([dataclasses.replace(c, seed=s) for c in chosen for s in tune])
     costs = np.array([cost(row) for row in rows]).reshape(sets, len(tune)).mean(axis=1)
     best = int(np.argmin(costs))
-    final = run([dataclasses.replace(c, seed=s) for c in (candidates[best], base) for s in report])
+    final = run([dataclasses.replace(c, seed=s) for c in (chosen[best], chosen[0]) for s in report])
     return {
         "sets": sets,
         "best_set": best,

@@ -64,7 +64,7 @@ def main() -> None:
     cli.configure_jax(one_core=args.jobs == 1)
     chosen = [experiment for experiment in EXPERIMENTS if experiment.name in args.only]
     (folder / "figures").mkdir(exist_ok=True)
-    code = code_version(Path(__file__), Path(paper_results.__file__))
+    code = code_version(*map(Path, (__file__, paper_results.__file__, koopman_fit.__file__)))
     before = _read(folder / "results.json")
     record: dict[str, Any] = {
         "provenance": cli.provenance(), "code": code, "quick": args.quick, "experiments": {}
@@ -126,8 +126,9 @@ def _kept(before: dict[str, Any], args: Namespace) -> dict[str, Any]:
                 again = experiment.name in args.only and base in args.bases
                 print(f"{experiment.name} ({base}): its config has changed; "
                       + ("it is run again" if again else "its results are dropped"))  # fmt: skip
-    if FIT in before["experiments"]:
-        kept[FIT] = before["experiments"][FIT]
+    fit = before["experiments"].get(FIT, {})
+    if fit.get("config") == config_hash(_fit_config(quick=args.quick)):
+        kept[FIT] = fit
     return kept
 
 
@@ -137,8 +138,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _fit(folder: Path, *, quick: bool) -> dict[str, Any]:
     """The fit study of Fig. 3; its statistics and the hash of what they came from."""
-    overrides = {"scales": [1.0], "test_states": 5, "test_profiles": 5} if quick else {}
-    config = load_config(FitStudyConfig, CONFIGS / "koopman_fit.toml", overrides)
+    config = _fit_config(quick=quick)
     store = Store(folder / "fit.json", code_version(Path(koopman_fit.__file__)), section="fits")
     key, figure = config_hash(config), folder / "figures" / f"{FIT}.png"
     if key not in store.done or not figure.exists():
@@ -147,6 +147,11 @@ def _fit(folder: Path, *, quick: bool) -> dict[str, Any]:
         save_figure(config, curves, figure)
         store.add(key, result)
     return {"config": key, **store.done[key]}
+
+
+def _fit_config(*, quick: bool) -> FitStudyConfig:
+    overrides = {"scales": [1.0], "test_states": 5, "test_profiles": 5} if quick else {}
+    return load_config(FitStudyConfig, CONFIGS / "koopman_fit.toml", overrides)
 
 
 def _measure(

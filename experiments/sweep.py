@@ -13,7 +13,7 @@ from typing import Any
 import jax
 
 from kjax import cli
-from kjax.config import ConfigError, SweepConfig, load_config
+from kjax.config import ConfigError, SweepConfig, load_config, to_dict
 
 
 def main() -> None:
@@ -108,9 +108,32 @@ def draw(sweep: SweepConfig, folder: Path, config: str) -> None:
 
     try:
         with xr.open_dataset(folder / "sweep.nc") as dataset:
+            require_sweep(dataset, sweep, folder)
             report(dataset.load(), sweep, folder)
     except (OSError, ValueError) as error:
         cli.fail(f"--draw: {folder / 'sweep.nc'} with {config}: {error}")
+
+
+# What decides which cases a sweep has, but for the number of their seeds.
+WALKED = ("base", "set", "sample", "sample_seed")
+VALUES = ("values", "low", "high", "count")
+
+
+def require_sweep(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
+    """End the program where the folder holds another sweep; figure, units and labels may differ."""
+
+    def walked(spec: dict[str, Any]) -> Any:
+        axes = {name: [axis[key] for key in VALUES] for name, axis in spec["axes"].items()}
+        return json.loads(json.dumps([axes, *(spec[key] for key in WALKED)]))
+
+    try:
+        held = walked(json.loads(dataset.attrs["sweep"]))
+    except (KeyError, TypeError, ValueError):
+        cli.fail(f"--draw: {folder / 'sweep.nc'} does not say which sweep it is of")
+    if held != walked(to_dict(sweep)):
+        cli.fail(
+            f"--draw: {folder / 'sweep.nc'} holds another sweep: its base, axes or keys differ"
+        )
 
 
 def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:

@@ -63,7 +63,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     except ValueError as error:
         cli.fail(f"--{error}" if str(error).startswith("keys") else str(error))
     begin = worsened(space, args.worsen, args.worsen_seed)
-    identity = config_hash(short) + json.dumps([code_version(), *_settings(args)])
+    identity = config_hash(short) + json.dumps([code_version(Path(__file__)), *_settings(args)])
     checkpoint = folder / "checkpoint.npz"
     try:
         check_checkpoint(checkpoint, identity)

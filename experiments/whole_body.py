@@ -9,8 +9,8 @@ Leaves metrics.json (ratios), table.md (every model that an LMPC can predict wit
 figure.png and, for each gait, residual_<gait>.npz and
 residual_<gait>_clock_history.npz (the affine residual and the one that knows the place in the phase
 and the last force, for koopman.model = "residual" with koopman.dataset.dt = 0.005) and
-weights_<gait>.npz (all models). The recordings stay there as well and are used again while their
-configs are the same.
+weights_<gait>.npz (all models). The recordings stay there as well and are used again; a folder
+with those of other configs or other code is refused.
 """
 
 import json
@@ -27,6 +27,7 @@ from prediction_models import residual
 
 from kjax import cli, srb
 from kjax.config import RunConfig, SrbConfig, load_config, to_dict
+from kjax.episodes import code_version
 from kjax.koopman import open_loop, storage, whole_body
 from kjax.koopman.features import (
     Features,
@@ -94,6 +95,9 @@ def main() -> None:
         cli.fail(f"--force: got {args.force} N, wanted more than 0")
     cli.configure_jax()
     folder = cli.output_folder(args, "whole_body")
+    for kinds in GAITS.values():
+        for kind in kinds[:1] if args.quick else kinds:
+            kept(kind, args, folder)  # before the first study begins
     metrics: dict[str, Any] = {}
     curves: dict[str, Any] = {}
     families: dict[str, Any] = {}
@@ -165,20 +169,41 @@ def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[
     return configs
 
 
+def kept(kind: str, args: Any, folder: Path) -> dict[str, np.ndarray] | None:
+    """A kind's recording where it lies in the folder; ends the program where another one does."""
+    path = folder / f"episodes_{kind}.npz"
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as data:
+            arrays = dict(data)
+            held = str(arrays.pop("configs")), str(arrays.pop("code", "none"))
+    except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
+        cli.fail(f"{path}: damaged ({error}); remove it, and only it is recorded again")
+    if held != label(kind_configs(kind, args.robots, args.duration, args.force)):
+        cli.fail(
+            f"{path} holds episodes of another config or other code: give --out another folder, or "
+            "remove it"
+        )
+    return arrays
+
+
+def label(configs: list[RunConfig]) -> tuple[str, str]:
+    """What a recording comes from: configs and code."""
+    wanted = json.dumps([to_dict(config) for config in configs], sort_keys=True)
+    return wanted, code_version(Path(__file__))
+
+
 def record(kind: str, args: Any, folder: Path) -> list[Episode]:
     """Episodes of a kind, from the folder where they lie there already."""
     from kjax.sim.batch_loop import BatchEngine
 
+    there = kept(kind, args, folder)
+    if there is not None:
+        print(f"{kind}: {args.robots} episodes of {args.duration:g} s are there", flush=True)
+        return _episodes(there)
     configs = kind_configs(kind, args.robots, args.duration, args.force)
-    wanted = json.dumps([to_dict(config) for config in configs], sort_keys=True)
     path = folder / f"episodes_{kind}.npz"
-    if path.exists():
-        with np.load(path) as data:
-            if str(data["configs"]) == wanted:
-                print(
-                    f"{kind}: {args.robots} episodes of {args.duration:g} s are there", flush=True
-                )
-                return _episodes({name: data[name] for name in data.files})
     print(f"{kind}: recording {args.robots} episodes of {args.duration:g} s ...", flush=True)
     begin = time.perf_counter()
     run = BatchEngine(configs[0], torques="held").run(configs)
@@ -197,7 +222,8 @@ def record(kind: str, args: Any, folder: Path) -> list[Episode]:
         "fell": run.fell,
     }
     scratch = path.with_suffix(".part.npz")
-    np.savez_compressed(scratch, configs=wanted, **arrays)
+    wanted, code = label(configs)
+    np.savez_compressed(scratch, configs=wanted, code=code, **arrays)
     scratch.replace(path)
     print(f"  {run.fell.sum()} falls, {time.perf_counter() - begin:.0f} s", flush=True)
     return _episodes(arrays)

@@ -12,9 +12,9 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +49,9 @@ def code_version(*files: Path) -> str:
             digest.update(inside.as_posix().encode() + path.read_bytes())
     for file in files:
         digest.update(file.name.encode() + file.read_bytes())
-    for package in ("jax", "mujoco", "numpy"):
-        digest.update(version(package).encode())
+    for package in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy"):
+        with suppress(PackageNotFoundError):
+            digest.update(f"{package} {version(package)}".encode())
     return digest.hexdigest()[:16]
 
 
