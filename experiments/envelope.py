@@ -8,7 +8,7 @@ the strongest one up to which every push passes at every phase.
 
 Leaves results.json and figure.png in the output folder. Every episode is kept there, so the same
 command goes on after Ctrl-C. A point is 20 episodes of 6 to 10 s, less where two of them have
-failed already.
+failed already. On two cores a bisection takes about 2 minutes, a map of pushes about 13.
 """
 
 import dataclasses

@@ -43,7 +43,7 @@ def run_batch(
       store: of results.
       configs: of the robots, with one ``cases.batch_part`` and one duration.
       torques: ``"every_step"``, as on the robot, or ``"held"`` over a control tick.
-      chunk: robots that walk together and are kept together.
+      chunk: robots of one batch, which are kept together.
       threads: of the engine; one per core if ``None``.
       record: called with a run and the path of a file of its own,
       recorded: for the first so many configs.
@@ -70,8 +70,8 @@ def run_batch(
             if engine is None:
                 engine = BatchEngine(configs[0], torques=torques, threads=threads, dtype=np.float64)
             # All chunks have one number of robots, so that one compilation serves them.
-            walked = [configs[number] for number in [*some, *[some[-1]] * (size - len(some))]]
-            recording = engine.run(walked)
+            padded = [configs[number] for number in [*some, *[some[-1]] * (size - len(some))]]
+            recording = engine.run(padded)
             if recording.interrupted:
                 raise KeyboardInterrupt
             for robot, number in enumerate(some):

@@ -188,6 +188,8 @@ def _run(
         for key, config, file in zip(keys, configs, files, strict=True)
         if key not in results
     ]
+    if enough is not None and results and enough(list(results.values())):
+        tasks = []  # as the call before found that kept them
     with tqdm(
         total=len(keys), initial=len(results), desc=label, unit="episode", disable=None, leave=False
     ) as bar:

@@ -178,6 +178,16 @@ def test_a_call_ends_when_enough_is_known(config, tmp_path):
     assert [result is None for result in results] == [False, True, True]
 
 
+def test_a_call_of_which_enough_is_kept_runs_nothing(config, tmp_path, monkeypatch):
+    store = episodes.Store(tmp_path / "episodes.json", "code")
+    chosen = seeds(config, 3)
+    store.add(episodes.config_hash(chosen[1]), {"interrupted": False})
+    monkeypatch.setattr(episodes, "_episode", lambda *a: pytest.fail("an episode was run"))
+    with episodes.open_runner(store) as run:
+        results = run(chosen, enough=lambda results: len(results) >= 1)
+    assert [result is None for result in results] == [True, False, True]
+
+
 def test_what_is_recorded_of_a_run_is_made_again_where_it_is_missing(config, tmp_path):
     store = episodes.Store(tmp_path / "episodes.json", "code")
     (one,) = seeds(config, 1)

@@ -140,6 +140,14 @@ def test_a_step_that_is_none_is_refused(dt):
     assert "dt must be a positive time" in refusal(motion(), dt=dt)
 
 
+@pytest.mark.parametrize("field", ["states", "inputs", "feet"])
+@pytest.mark.parametrize("kind", [complex, object, str])
+def test_samples_that_are_no_real_numbers_are_refused(field, kind):
+    data = motion()
+    text = refusal(data._replace(**{field: getattr(data, field).astype(kind)}))
+    assert text.startswith(f"{field}: got values of type")
+
+
 def test_observables_that_are_not_finite_are_refused_by_name():
     mine = observables.own(lambda x: jnp.stack([jnp.sqrt(x[3]), x[5] ** 2]), names=["root", "sq"])
     text = refusal(motion(), mine)
