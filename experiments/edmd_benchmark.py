@@ -27,6 +27,8 @@ from kjax import cli, srb
 from kjax.config import KoopmanConfig, SrbConfig
 from kjax.koopman import edmd, models, observables, regression
 from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
+from kjax.rigid_body import own_body
+from kjax.robots import go1
 from kjax.types import GRAVITY, MODE_ALPHA, STATE_NAMES, Mode
 
 PEERS = ("pykoopman", "pykoop")
@@ -119,9 +121,9 @@ def summary(result: dict[str, Any]) -> dict[str, Any]:
 
 def setting() -> Setting:
     """Trot, Go1, and the ranges that the controller's models are fitted on."""
-    config = KoopmanConfig().dataset
+    config, body = KoopmanConfig().dataset, own_body(SrbConfig(), go1.PARAMS)
     return Setting(
-        body=jax.tree.map(lambda leaf: leaf[Mode.TROT], edmd.srb_params(SrbConfig())),
+        body=jax.tree.map(lambda leaf: leaf[Mode.TROT], edmd.srb_params(body)),
         alpha=jnp.asarray(MODE_ALPHA[Mode.TROT], float),
         ranges=ranges_from_config(config, vary_feet=False),
         rollouts=config.rollouts,

@@ -17,6 +17,8 @@ from kjax.config import FitStudyConfig
 from kjax.koopman.dataset import SampleRanges, ranges_from_config, shrink
 from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
 from kjax.koopman.validate import ErrorStatistics, prediction_errors, summarise
+from kjax.rigid_body import own_body
+from kjax.robots import go1
 from kjax.types import MODE_ALPHA, STATE_NAMES, STATE_UNITS, Mode
 
 MODES = {"trot": Mode.TROT, "front": Mode.FRONT, "rear": Mode.REAR}
@@ -53,7 +55,7 @@ def fit_study(config: FitStudyConfig) -> tuple[dict[str, Any], dict[str, Any]]:
       ValueError: if the fit is not finite.
     """
     koopman, data = config.koopman, config.koopman.dataset
-    dictionary, body = build_dictionary(koopman), srb_params(config.srb)
+    dictionary, body = build_dictionary(koopman), srb_params(own_body(config.srb, go1.PARAMS))
     steps = round(config.test_duration / data.dt)
     chosen = jnp.asarray(list(MODES.values()))
 

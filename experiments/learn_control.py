@@ -23,6 +23,7 @@ from kjax.config import CommandConfig, RunConfig, load_config
 from kjax.koopman import edmd, families, learned, storage
 from kjax.koopman.dataset import ranges_from_config, sample
 from kjax.params import build_params
+from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.sim.batch_loop import BatchEngine
 from kjax.sim.closed_cost import recording_costs
@@ -123,7 +124,7 @@ def short(args: argparse.Namespace, path: Path) -> RunConfig:
 def draw(seed: int, rollouts: int) -> Any:
     """Rollouts of the trot's rigid body on the ranges of the config."""
     config = RunConfig()
-    body = jax.tree.map(lambda a: a[Mode.TROT], edmd.srb_params(config.srb))
+    body = jax.tree.map(lambda a: a[Mode.TROT], edmd.srb_params(own_body(config.srb, go1.PARAMS)))
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
     ranges = ranges_from_config(config.koopman.dataset, vary_feet=False)
     one = partial(sample, rollouts=rollouts, steps=STEPS, dt=DT)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from kjax.config import RunConfig, load_config
 from kjax.gait import Gait
-from kjax.params import build_gaits
+from kjax.walkable import build_gaits
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

@@ -40,6 +40,7 @@ from kjax.koopman.features import (
 from kjax.koopman.prediction import build_family
 from kjax.koopman.whole_body import Episode, Transitions
 from kjax.params import fit_models
+from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import Mode
 
@@ -396,7 +397,7 @@ def _choose(
 
 
 def _body() -> srb.SrbParams:
-    config = SrbConfig()
+    config = own_body(SrbConfig(), go1.PARAMS)
     return srb.SrbParams(
         mass=jnp.asarray(config.mass), inertia=jnp.asarray(config.inertia), feet=jnp.zeros((2, 2))
     )

@@ -1,9 +1,9 @@
 """The controller: pure functions ``init``, ``plan``, ``act`` and ``step`` over plain pytrees.
 
-``plan`` runs at the MPC rate: phase clock, reference, lift, QP. ``act`` runs at the physics rate:
-swing feet follow their paths, stance feet press the planned forces. Both take and return the same
-``ControllerState``; nothing is hidden, so they run in a Python loop, in ``lax.scan`` and under
-``vmap`` alike. The caller owns ``jit``.
+``plan`` runs at the MPC rate: phase clock, reference, lift, QP. ``act`` runs several times in
+between: swing feet follow their paths, stance feet press the planned forces. Both take and return
+the same ``ControllerState``; nothing is hidden, so they run in a Python loop, in ``lax.scan`` and
+under ``vmap`` alike. The caller owns ``jit``.
 """
 
 from collections.abc import Callable
@@ -16,29 +16,49 @@ from jaxtyping import Array, Bool, Float, Int
 from kjax import gait, qp
 from kjax.config import RunConfig
 from kjax.legs import lateral, swing
-from kjax.legs.base import LegCommand, View, build_base
+from kjax.legs.base import Footing, LegCommand, View, build_base
+from kjax.legs.kinematics import PlanarState
 from kjax.mpc.lmpc import LmpcMemory, start_memory
+from kjax.observation import (
+    MAX_JOINT_RATE,
+    cast,
+    check_observation,
+    is_concrete,
+    is_valid,
+    or_neutral,
+)
 from kjax.params import ControllerParams
 from kjax.planning import ForceTask, Planner, build_planner, periodic_motion
 from kjax.types import Observation
 
 
 class ControllerState(NamedTuple):
-    """What the controller remembers between calls.
+    """What the controller remembers between calls; nothing in it depends on where zero is.
+
+    Points are in the *local* frame: origin at the trunk's, axes of the world (planar base) or of
+    the track frame of ``legs.spatial`` (free base). They are carried along by the trunk's velocity,
+    so that no position estimate enters.
 
     Attributes:
       time: since ``init`` [s].
       clock: place in the gait.
       stance: (4,) scheduled stance legs.
-      position: integrated reference of p_x [m].
+      lag: reference of p_x less p_x, the integral of the velocity's error, bounded [m].
       velocity_command: velocity commanded now [m/s].
-      ground: height of the ground under the last stance feet [m].
+      ground: height of the ground under the last stance feet, local frame [m].
       velocity: reference of v_x, which follows the command at a bounded rate [m/s].
       correction: integrals of the errors of velocity and pitch, added to their references
         [m/s, rad].
       memory: of the LMPC within a stance: its last plan and where the QP goes on from.
       force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
-      swing: state of the swing legs.
+      swing: state of the swing legs, local frame.
+      feet: (4, d) foot centres in the last valid sample, local frame [m].
+      base_vel: (d,) velocity of the trunk in that sample, local axes [m/s].
+      torque: (4, 3) last torque of a valid sample [N m].
+      blind_time: time without a valid sample [s].
+      contact_time: (4,) how long each contact flag has been on without a break [s].
+      contradiction: (4,) share of the last 0.1 s or so in which a leg's flag said what its
+        kinematics deny [-].
       track: (2,) cosine and sine of the heading to keep, the trunk's at ``init``, world [-];
         ``None`` on the planar base.
     """
@@ -46,7 +66,7 @@ class ControllerState(NamedTuple):
     time: Float[Array, ""]
     clock: gait.Clock
     stance: Bool[Array, "4"]
-    position: Float[Array, ""]
+    lag: Float[Array, ""]
     velocity_command: Float[Array, ""]
     ground: Float[Array, ""]
     velocity: Float[Array, ""]
@@ -54,6 +74,12 @@ class ControllerState(NamedTuple):
     memory: LmpcMemory
     force: Float[Array, "4 2"]
     swing: swing.SwingState
+    feet: Float[Array, "4 d"]
+    base_vel: Float[Array, "d"]
+    torque: Float[Array, "4 3"]
+    blind_time: Float[Array, ""]
+    contact_time: Float[Array, "4"]
+    contradiction: Float[Array, "4"]
     track: Float[Array, "2"] | None
 
 
@@ -66,8 +92,11 @@ class PlanInfo(NamedTuple):
       residual: relative KKT residual of the solver's point [-].
       iterations: of the solver.
       mode: contact mode.
-      x: (6,) SRB state as estimated from the observation.
-      reference: (6,) state wanted one model step ahead.
+      x: (6,) SRB state as estimated from the observation; p_x and p_z from the ground below the
+        centre of mass [m, rad, m/s, rad/s].
+      reference: (6,) state wanted one model step ahead, likewise.
+      contact_fault: (4,) legs whose contact flag keeps contradicting their kinematics.
+      blind_time: time without a valid sample, this one included [s].
     """
 
     status: Int[Array, ""]
@@ -76,20 +105,26 @@ class PlanInfo(NamedTuple):
     mode: Int[Array, ""]
     x: Float[Array, "6"]
     reference: Float[Array, "6"]
+    contact_fault: Bool[Array, "4"]
+    blind_time: Float[Array, ""]
 
 
 class Controller(NamedTuple):
     """A controller is a record of pure functions.
 
     Attributes:
-      init: (params, observation) -> state.
+      init: (params, observation) -> state. Outside ``jit`` it raises a ValueError for a sample in
+        another convention (``observation.check_observation``).
       plan: (params, state, observation) -> (state, info), once per control_dt.
-      act: (params, state, observation) -> (state, torque), once per sim_dt; torque (4, 3) [N m]
+      act: (params, state, observation) -> (state, torque), once per act_dt; torque (4, 3) [N m]
         of (abduction, thigh, calf) in leg order, within the robot's limits.
       step: plan, then act: (params, state, observation) -> (state, torque, info).
       init_from: (params, view) -> state; ``init`` for a caller that knows the view itself, such as
-        a rigid body without legs (``kjax.tuning``).
-      plan_from: (params, state, view, contact, readable) -> (state, info); ``plan`` likewise.
+        a rigid body without legs (``kjax.tuning``). The view is in the local frame, see
+        ``ControllerState``.
+      plan_from: (params, state, view, contact, valid) -> (state, info); ``plan`` likewise.
+      control_dt: time between two plans [s].
+      act_dt: time between two calls of ``act`` [s].
     """
 
     init: Callable[[ControllerParams, Observation], ControllerState]
@@ -109,6 +144,12 @@ class Controller(NamedTuple):
         [ControllerParams, ControllerState, View, Bool[Array, "4"], Bool[Array, ""]],
         tuple[ControllerState, PlanInfo],
     ]
+    control_dt: float
+    act_dt: float
+
+
+FAULT_TIME = 0.5  # s, over which a contact flag's contradictions are averaged
+FAULT_SHARE = 0.04  # of the samples; a swing that grazes a block contradicts for a few ms
 
 
 def build_controller(config: RunConfig, planner: Planner | None = None) -> Controller:
@@ -119,156 +160,184 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
       planner: of forces; that of the config if ``None``.
     """
     lmpc = config.lmpc
-    sim_dt = config.sim.sim_dt
+    control_dt, act_dt = lmpc.control_dt, config.leg.act_dt
     base = build_base(config.sim.base)
     plan_forces = build_planner(config) if planner is None else planner
+    flicker_time = max(FLICKER, 1.5 * act_dt)
     hessians_stay = config.koopman.feet == "fixed" and config.koopman.model == "linear"
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
-        observation = _cast(observation, params)
+        if is_concrete(observation):
+            check_observation(params.robot, observation)
+        observation = cast(observation, params.position_slack.dtype)
+        # The heading of a first sample that is no good is taken from the first good one.
+        valid = is_valid(observation)
+        observation = or_neutral(observation, valid)
         track = base.track(observation)
-        return init_from(params, base.view(params.robot, track, observation), track)
+        if track is not None:
+            track = jnp.where(valid, track, 0.0)
+        return init_from(params, base.view(params.robot, _facing(track), observation), track)
 
     def init_from(
         params: ControllerParams, view: View, track: Array | None = None
     ) -> ControllerState:
         zero = jnp.zeros_like(params.position_slack)
-        return ControllerState(
+        state = ControllerState(
             time=zero,
-            clock=gait.start(params.gaits[0], zero - lmpc.control_dt),  # first plan: phase 0
+            clock=gait.start(params.gaits[0], zero - control_dt),  # first plan: phase 0
             stance=jnp.ones((4,), bool),
-            position=view.planar.x[0],
+            lag=zero,
             velocity_command=zero,
-            ground=zero,
+            ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
             velocity=zero,
             correction=jnp.zeros((2,), zero.dtype),
             memory=start_memory(params.tables, lmpc, carry=hessians_stay),
             force=jnp.zeros((4, 2), zero.dtype),
             swing=swing.initial_swing(view.feet),
+            feet=view.feet,
+            base_vel=view.base_vel,
+            torque=jnp.zeros((4, 3), zero.dtype),
+            blind_time=zero,
+            contact_time=jnp.zeros((4,), zero.dtype),
+            contradiction=jnp.zeros((4,), zero.dtype),
             track=track,
         )
+        # A buffer of its own for every leaf, so that the state may be donated.
+        return jax.tree.map(jnp.copy, state)
 
     def plan(
         params: ControllerParams, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, PlanInfo]:
-        observation = _cast(observation, params)
-        readable = _all_finite(observation, state.track)
-        view = base.view(params.robot, state.track, _stand_in(observation, readable, params))
-        return plan_from(params, state, view, observation.contact, readable)
+        observation = cast(observation, params.position_slack.dtype)
+        valid = is_valid(observation)
+        observation = or_neutral(observation, valid)
+        if state.track is not None:
+            unset = valid & (state.track == 0.0).all()
+            state = state._replace(track=jnp.where(unset, base.track(observation), state.track))
+        view = base.view(params.robot, _facing(state.track), observation)
+        return plan_from(params, state, view, observation.contact, valid)
 
     def plan_from(
         params: ControllerParams,
         state: ControllerState,
         view: View,
         contact: Array,
-        readable: Array,
+        valid: Array,
     ) -> tuple[ControllerState, PlanInfo]:
-        body = view.planar
-        schedule = params.schedule
-
-        clock = next_clock(params, state, lmpc.control_dt)
+        clock = next_clock(params, state, control_dt)
         where = (clock.gait, clock.phase)
-        stance, mode = schedule.stance[where], schedule.mode[where]
-        lifting = state.stance & ~stance
-        switched = clock.gait != state.clock.gait
-        # A new gait gives legs that are in the air already another time to come down.
-        anew = ~stance & switched
-        swings = swing.begin_swings(
-            state.swing, lifting | anew, view.feet, gait.time_to_touchdown(schedule, clock)
-        )
-        cut = stance & ~state.stance & switched
-        swings = swing.end_swings(params.swing, swings, stance, cut, contact, view.feet)
-
-        command = params.command.velocities[_piece(params.command.times, state.time)]
-        change = params.command_slew * lmpc.control_dt
-        velocity = state.velocity + jnp.clip(command - state.velocity, -change, change)
-        usual = periodic_motion(params, clock.gait, clock.phase, clock.cycle, clock.elapsed)
-        error = jnp.stack([velocity - body.x[3], usual[1] - body.x[2]])
-        rate, limit = params.integral
-        # Errors beyond the limit are a step on its way, not a bias.
-        correction = state.correction + rate * lmpc.control_dt * jnp.clip(error, -limit, limit)
-        # What one gait's model misses says nothing about another's.
-        correction = jnp.where(switched, 0.0, jnp.clip(correction, -limit, limit))
-        target = velocity + correction[0]
-        slack = params.position_slack
-        position = jnp.clip(
-            state.position + target * lmpc.control_dt, body.x[0] - slack, body.x[0] + slack
-        )
-        count = jnp.sum(stance)
-        under = jnp.sum(jnp.where(stance, body.feet[:, 1] - params.robot.foot_radius, 0.0))
-        ground = jnp.where(count > 0, under / jnp.maximum(count, 1), state.ground)
+        stance, mode = params.schedule.stance[where], params.schedule.mode[where]
+        feet = jnp.where(valid, view.feet, state.feet)
+        swings = _next_swings(params, state, clock, stance, contact, feet)
+        heights = feet[:, -1] - params.robot.foot_radius
+        ground = _mean_height(heights, stance, state.ground)
+        wanted = _next_reference(params, state, clock, view.planar, control_dt)
         solved = plan_forces(
             params,
             ForceTask(
                 clock=clock,
                 stance=stance,
                 mode=mode,
-                body=body,
-                readable=readable,
-                position=position,
-                velocity=target,
-                command=command + correction[0],
-                height=params.height[clock.gait] + params.follow_ground * ground,
-                ground=ground,
-                lean=correction[1],
+                body=_above_ground(view.planar, ground),
+                valid=valid,
+                lag=wanted.lag,
+                velocity=wanted.velocity + wanted.correction[0],
+                command=wanted.command + wanted.correction[0],
+                height=params.height[clock.gait],
+                pitch_offset=wanted.correction[1],
                 memory=state.memory,
             ),
         )
-
-        moved = ControllerState(
-            time=state.time + lmpc.control_dt,
+        next_state = state._replace(
+            time=state.time + control_dt,
             clock=clock,
             stance=stance,
-            position=jnp.where(readable, position, state.position),
-            velocity_command=command,
-            ground=jnp.where(readable, ground, state.ground),
-            velocity=velocity,
-            correction=jnp.where(readable, correction, state.correction),
+            lag=jnp.where(valid, wanted.lag, state.lag),
+            velocity_command=wanted.command,
+            ground=jnp.where(valid, ground, state.ground),
+            velocity=wanted.velocity,
+            correction=jnp.where(valid, wanted.correction, state.correction),
             memory=solved.memory,
-            force=jnp.broadcast_to(solved.ends[:, None], (2, 2, 2)).reshape(4, 2) * stance[:, None],
-            swing=jax.tree.map(lambda new, old: jnp.where(readable, new, old), swings, state.swing),
-            track=state.track,
+            force=jnp.repeat(solved.pair_force, 2, axis=0) * stance[:, None],
+            swing=swings,
+            feet=feet,
         )
         info = PlanInfo(
-            status=jnp.where(readable, solved.status, qp.Status.NON_FINITE).astype(jnp.int32),
-            residual=jnp.where(readable, solved.residual, jnp.inf),
+            status=jnp.where(valid, solved.status, qp.Status.NON_FINITE).astype(jnp.int32),
+            residual=jnp.where(valid, solved.residual, jnp.inf),
             iterations=solved.iterations,
             mode=mode,
-            x=body.x,
+            x=_above_ground(view.planar, ground).x,
             reference=solved.reference,
+            contact_fault=state.contradiction > FAULT_SHARE,
+            blind_time=jnp.where(valid, 0.0, state.blind_time + act_dt),
         )
-        return moved, info
+        return next_state, info
 
     def act(
         params: ControllerParams, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, Array]:
-        observation = _cast(observation, params)
-        readable = _all_finite(observation, state.track)
-        observation = _stand_in(observation, readable, params)
+        observation = cast(observation, params.position_slack.dtype)
+        valid = is_valid(observation)
+        joint_vel = observation.joint_vel
+        observation = or_neutral(observation, valid)
         robot = params.robot
-        view = base.view(robot, state.track, observation)
-        where = (state.clock.gait, state.clock.phase)
-
+        view = base.view(robot, _facing(state.track), observation)
         settings = swing.for_gait(params.swing, state.clock.gait)
-        swings = swing.continue_swings(
-            settings,
-            state.swing,
-            ~state.stance & readable,
-            observation.contact,
-            view.feet,
-            sim_dt,
-        )
-        command = LegCommand(
-            stance=state.stance & ~swings.reaching,
-            force=state.force,
-            swing=swings,
-            stance_time=params.schedule.stance_time[where],
-            velocity=state.velocity + state.correction[0],
-        )
         sideways = lateral.for_gait(params.lateral, state.clock.gait)
+
+        # Step 1: where the feet in the air shall be.
+        swings = swing.advance(state.swing, ~state.stance, act_dt)
+        footing = Footing(
+            remaining=jnp.maximum(swings.duration - swings.elapsed, 0.0),
+            stance_time=params.schedule.stance_time[state.clock.gait, state.clock.phase],
+            velocity=state.velocity + state.correction[0],
+            ground=state.ground,
+        )
+        target = base.foothold(robot, settings, sideways, view, footing)
+        foot, foot_vel = swing.foot_path(settings, swings, target)
+
+        # Step 2: what they have hit meanwhile.
+        contact = observation.contact & valid
+        contact_time = jnp.where(contact, state.contact_time + act_dt, 0.0)
+        blocked, denied = swing.believable_contact(
+            contact_time,
+            swings.elapsed,
+            (view.feet, view.feet_vel),
+            (foot, foot_vel),
+            state.ground + robot.foot_radius,
+        )
+        flicker = ~contact & (state.contact_time > 0) & (state.contact_time < flicker_time)
+        swings = swing.hold_feet(
+            settings, swings, ~state.stance, blocked & valid, contact, flicker, view.feet, act_dt
+        )
+        foot, foot_vel = swing.held_or_on_path(settings, swings, foot, foot_vel)
+
+        # Step 3: torques, those of the last valid sample for a while, then damping.
+        command = LegCommand(state.stance & ~swings.reaching, state.force, foot, foot_vel)
         torque = base.torque(robot, settings, sideways, view, command, observation)
+        blind_time = jnp.where(valid, 0.0, state.blind_time + act_dt)
+        held = jnp.where(blind_time <= params.hold_time, state.torque, _damping(params, joint_vel))
+        torque = jnp.where(valid, torque, held)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
-        return state._replace(swing=swings), jnp.where(readable, torque, 0.0)
+
+        # Step 4: the local frame moves on with the trunk.
+        base_vel = jnp.where(valid, view.base_vel, state.base_vel)
+        motion = act_dt * base_vel
+        missing = state.stance & ~contact & (state.clock.elapsed > CONTACT_DELAY)
+        fault = jnp.where(state.stance, missing, denied).astype(torque.dtype)
+        share = state.contradiction + act_dt / FAULT_TIME * (fault - state.contradiction)
+        next_state = state._replace(
+            swing=swing.carry_along(swings, motion),
+            ground=state.ground - motion[-1],
+            feet=jnp.where(valid, view.feet, state.feet) - motion,
+            base_vel=base_vel,
+            torque=torque,
+            blind_time=blind_time,
+            contact_time=contact_time,
+            contradiction=jnp.where(valid, share, state.contradiction),
+        )
+        return next_state, torque
 
     def step(
         params: ControllerParams, state: ControllerState, observation: Observation
@@ -278,45 +347,106 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
         return state, torque, info
 
     return Controller(
-        init=init, plan=plan, act=act, step=step, init_from=init_from, plan_from=plan_from
+        init=init,
+        plan=plan,
+        act=act,
+        step=step,
+        init_from=init_from,
+        plan_from=plan_from,
+        control_dt=control_dt,
+        act_dt=act_dt,
     )
+
+
+FLICKER = 0.004  # s; a contact that is over sooner was none, or has bounced off
+CONTACT_DELAY = 0.05  # s into its stance, after which a foot without contact is a fault
+
+
+class _Reference(NamedTuple):
+    """What the body is to do: see the fields of the same names in ``ControllerState``."""
+
+    lag: Array
+    command: Array
+    velocity: Array
+    correction: Array
+
+
+def _next_reference(
+    params: ControllerParams,
+    state: ControllerState,
+    clock: gait.Clock,
+    body: PlanarState,
+    control_dt: float,
+) -> _Reference:
+    """Reference velocity, its integral, and the slow corrections, one control tick on."""
+    command = params.command.velocities[_piece(params.command.times, state.time)]
+    command = jnp.where(jnp.isfinite(command), command, state.velocity_command)
+    change = params.command_slew * control_dt
+    velocity = state.velocity + jnp.clip(command - state.velocity, -change, change)
+    periodic_ref = periodic_motion(params, clock.gait, clock.phase, clock.cycle, clock.elapsed)
+    error = jnp.stack([velocity - body.x[3], periodic_ref[1] - body.x[2]])
+    rate, limit = params.integral
+    # Errors beyond the limit are a step on its way, not a bias.
+    correction = state.correction + rate * control_dt * jnp.clip(error, -limit, limit)
+    # What one gait's model misses says nothing about another's.
+    switched = clock.gait != state.clock.gait
+    correction = jnp.where(switched, 0.0, jnp.clip(correction, -limit, limit))
+    slack = params.position_slack
+    lag = state.lag + (velocity + correction[0] - body.x[3]) * control_dt
+    return _Reference(jnp.clip(lag, -slack, slack), command, velocity, correction)
+
+
+def _next_swings(
+    params: ControllerParams,
+    state: ControllerState,
+    clock: gait.Clock,
+    stance: Array,
+    contact: Array,
+    feet: Array,
+) -> swing.SwingState:
+    """Swings after the clock has moved on: begun, ended, or given another time to come down."""
+    switched = clock.gait != state.clock.gait
+    lifting = state.stance & ~stance
+    # A new gait gives legs that are in the air already another time to come down.
+    retimed = ~stance & switched
+    remaining = gait.time_to_touchdown(params.schedule, clock)
+    swings = swing.begin_swings(state.swing, lifting | retimed, feet, remaining)
+    interrupted = stance & ~state.stance & switched
+    return swing.end_swings(params.swing, swings, stance, interrupted, contact, feet)
+
+
+def _mean_height(heights: Array, stance: Array, otherwise: Array) -> Array:
+    """Mean height of the stance feet [m]; ``otherwise`` where none stands."""
+    count = jnp.sum(stance)
+    total = jnp.sum(jnp.where(stance, heights, 0.0))
+    return jnp.where(count > 0, total / jnp.maximum(count, 1), otherwise)
+
+
+def _above_ground(body: PlanarState, ground: Array) -> PlanarState:
+    """The body in the frame whose origin is the ground below its centre of mass."""
+    origin = jnp.stack([body.x[0], ground])
+    return body._replace(
+        x=body.x.at[:2].add(-origin), base=body.base - origin, feet=body.feet - origin
+    )
+
+
+def _facing(track: Array | None) -> Array | None:
+    """The heading to keep, straight ahead where it is not known yet."""
+    if track is None:
+        return None
+    return jnp.where((track == 0.0).all(), jnp.array([1.0, 0.0], track.dtype), track)
+
+
+def _damping(params: ControllerParams, joint_vel: Array) -> Array:
+    """Torques (4, 3) that slow the joints down; none where their rates are not known [N m]."""
+    known = jnp.abs(joint_vel) <= MAX_JOINT_RATE
+    return -params.blind_damping * jnp.where(known, joint_vel, 0.0)
 
 
 def next_clock(params: ControllerParams, state: ControllerState, control_dt: float) -> gait.Clock:
     """Place in the gait at the next plan, ``control_dt`` [s] after the last one."""
     wanted = params.gaits[_piece(params.gait_times, state.time)]
     return gait.advance(params.schedule, state.clock, control_dt, wanted)
-
-
-def _cast(observation: Observation, params: ControllerParams) -> Observation:
-    """Observation in the controller's floating type."""
-    dtype = params.position_slack.dtype
-    floats = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), observation)
-    return floats._replace(contact=jnp.asarray(observation.contact, bool))
-
-
-def _all_finite(observation: Observation, track: Array | None) -> Array:
-    """Whether the observation, and the heading that it is seen from, hold numbers only."""
-    leaves = [*observation[:-1], *([] if track is None else [track])]
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()
-
-
-def _stand_in(observation: Observation, readable: Array, params: ControllerParams) -> Observation:
-    """The observation, or a harmless one where it is not finite, so that no NaN spreads."""
-    harmless = Observation(
-        base_pos=jnp.array([0.0, 0.0, 0.3]),
-        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
-        base_vel=jnp.zeros(3),
-        base_ang_vel=jnp.zeros(3),
-        joint_pos=jnp.tile(jnp.array([0.0, 0.9, -1.8]), (4, 1)),
-        joint_vel=jnp.zeros((4, 3)),
-        contact=observation.contact,
-    )
-    return jax.tree.map(
-        lambda seen, safe: jnp.where(readable, seen, safe.astype(seen.dtype)),
-        observation,
-        harmless,
-    )
 
 
 def _piece(times: Float[Array, "K"], time: Float[Array, ""]) -> Int[Array, ""]:

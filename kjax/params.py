@@ -19,7 +19,9 @@ from kjax.koopman.validate import force_response_error
 from kjax.legs import lateral, swing
 from kjax.mpc import multiphase
 from kjax.mpc.lmpc import LmpcTables, build_tables, mode_settings
+from kjax.rigid_body import body_numbers, mean_force, own_body
 from kjax.types import MODE_ALPHA, Command, Mode, RobotParams
+from kjax.walkable import build_gaits, check_walkable, cycle_nodes
 
 
 class ControllerParams(NamedTuple):
@@ -40,12 +42,13 @@ class ControllerParams(NamedTuple):
       swing: swing settings.
       lateral: regulator of roll, yaw and sideways motion; of no effect on the planar base.
       command: forward velocity over time.
-      height: (G,) mean height of the centre of mass [m].
-      follow_ground: 1 to measure it from the stance feet, 0 from z = 0 [-].
+      height: (G,) mean height of the centre of mass above the ground [m].
       command_slew: largest rate of change of the reference velocity [m/s^2].
       integral: (2, 2) integral action on velocity and pitch: its rates [1/s] and its limits
         [m/s, rad].
-      position_slack: clamp of the position reference [m].
+      position_slack: clamp of the position reference's lag [m].
+      hold_time: how long the last torque holds without a valid sample [s].
+      blind_damping: joint damping after that [N m s/rad].
     """
 
     robot: RobotParams
@@ -61,10 +64,11 @@ class ControllerParams(NamedTuple):
     lateral: lateral.LateralParams
     command: Command
     height: Float[Array, "G"]
-    follow_ground: Float[Array, ""]
     command_slew: Float[Array, ""]
     integral: Float[Array, "2 2"]
     position_slack: Float[Array, ""]
+    hold_time: Float[Array, ""]
+    blind_damping: Float[Array, ""]
 
 
 def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) -> ControllerParams:
@@ -77,11 +81,15 @@ def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) ->
       config: of the run.
       robot: e.g. ``kjax.robots.go1.PARAMS``.
       dtype: floating type of the result; JAX's current default if ``None``.
+
+    Raises:
+      ValueError: for a config that this robot cannot walk with, naming the key.
     """
     dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    check_walkable(config, robot)
     with jax.enable_x64(True):
         fits = fit_models(config, robot)
-        _warn_of_fits(config, fits)
+        _warn_of_fits(config, robot, fits)
         params = jax.device_get(gather(config, robot, fits))
     return cast(params, dtype)
 
@@ -114,11 +122,12 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
     """
     bound = config.bound
     sole = float(robot.foot_radius - bound.height)
+    srb = own_body(config.srb, robot, config.lmpc.height)
     feet = ((bound.feet_front, sole), (-bound.feet_rear, sole))
     height = config.lmpc.height if config.koopman.model == "srb_hover" else 0.0
     # What a file holds may have changed since.
     fit = _fit.__wrapped__ if config.koopman.file else _fit
-    return fit(config.srb, config.koopman, feet, height)
+    return fit(srb, config.koopman, feet, height)
 
 
 @lru_cache(maxsize=32)
@@ -140,7 +149,7 @@ def _fit(
     return jax.device_get(Fits(model, body.feet, spread, prediction))
 
 
-def _warn_of_fits(config: RunConfig, fits: Fits) -> None:
+def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
     """Warn of a linear EDMD model that an LMPC over this horizon should not rely on."""
     if config.koopman.model != "linear":
         return
@@ -151,7 +160,8 @@ def _warn_of_fits(config: RunConfig, fits: Fits) -> None:
         for phase in one.phases
         if one.name in config.gait.names and not nodes.any()
     }
-    body = jax.device_get(srb_params(config.srb)._replace(feet=fits.feet))
+    srb = own_body(config.srb, robot, config.lmpc.height)
+    body = jax.device_get(srb_params(srb)._replace(feet=fits.feet))
     duration = config.lmpc.model_dt * config.lmpc.horizon
     for mode in sorted(planned - {Mode.FLIGHT}):
         model, here = (jax.tree.map(lambda a, m=mode: a[m], part) for part in (fits.model, body))
@@ -179,11 +189,13 @@ def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParam
     names = [g.name for g in gaits]
     leg, bound, sideways = config.leg, config.bound, config.lateral
     is_bound = np.array([name == "bound" for name in names])
+    foresees = cycle_nodes(gaits, config).any(axis=1)
+    mass, inertia = body_numbers(config, robot)
     return ControllerParams(
         robot=robot,
         tables=_build_tables(
             fits.model,
-            mode_settings(config.lmpc, bound, config.srb.mass),
+            mode_settings(config.lmpc, bound, mean_force(config, mass)),
             steps=round(config.lmpc.model_dt / config.koopman.dataset.dt),
             horizon=config.lmpc.horizon,
             feet=fits.feet,
@@ -195,7 +207,7 @@ def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParam
         schedule=gait.build_schedule(gaits),
         gait_times=jnp.asarray(config.gait.times),
         gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
-        reference=_reference_tables(gaits, config),
+        reference=_reference_tables(gaits, config, mass, inertia),
         multiphase=multiphase_params(gaits, config, robot),
         swing=swing.SwingParams(
             apex=jnp.where(is_bound, bound.apex, leg.apex),
@@ -213,9 +225,14 @@ def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParam
             damping=jnp.asarray(sideways.damping),
             weights=jnp.asarray(sideways.wrench_weights),
             ridge=jnp.asarray(sideways.force_weight),
-            friction=jnp.asarray(sideways.friction),
-            friction_offset=jnp.asarray(sideways.friction_offset),
-            friction_x=jnp.where(is_bound, sideways.plan_friction_bound, sideways.plan_friction),
+            friction=jnp.minimum(
+                sideways.friction,
+                jnp.where(foresees, config.multiphase.friction, config.lmpc.friction),
+            ),
+            torque_fraction=jnp.minimum(
+                1.0,
+                jnp.where(foresees, config.multiphase.torque_fraction, config.lmpc.torque_fraction),
+            ),
             foothold_gain=jnp.asarray(sideways.velocity_gain),
         ),
         command=Command(
@@ -223,12 +240,13 @@ def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParam
             velocities=jnp.asarray(config.command.velocities),
         ),
         height=jnp.where(is_bound, bound.height, config.lmpc.height),
-        follow_ground=jnp.asarray(float(config.lmpc.height_above == "feet")),
         command_slew=jnp.asarray(config.lmpc.command_slew, float),
         integral=jnp.stack(
             [jnp.asarray(config.lmpc.integral_gains), jnp.asarray(config.lmpc.integral_limits)]
         ),
         position_slack=jnp.asarray(config.lmpc.position_slack),
+        hold_time=jnp.asarray(leg.hold_time),
+        blind_damping=jnp.asarray(leg.blind_damping),
     )
 
 
@@ -236,50 +254,18 @@ _fit_modes = jax.jit(fit_modes, static_argnames="config")
 _build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon", "caution"))
 
 
-def build_gaits(config: RunConfig) -> list[gait.Gait]:
-    """The gaits of a config, in the order of their indices: trot, bound, stand, landing."""
-    chosen, bound = config.gait, config.bound
-    landing = "landing" if chosen.landing_time > 0 else ""
-    gaits = [
-        gait.trot(chosen.stance_time, chosen.trot_flight),
-        gait.bound(
-            bound.front_stance,
-            bound.first_flight,
-            bound.rear_stance,
-            bound.second_flight,
-            ramp_start=bound.ramp_start,
-            ramp_cycles=bound.ramp_cycles,
-            leave_anywhere=chosen.switch_rule == "anywhere",
-            leave_through=landing,
-        ),
-        gait.stand(),
-    ]
-    return [*gaits, gait.stand(chosen.landing_time, name=landing)] if landing else gaits
-
-
-def cycle_nodes(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
-    """Number of nodes (G, P) of each phase; zero for gaits that predict within a stance only."""
-    nodes = np.zeros((len(gaits), max(len(g.phases) for g in gaits)), int)
-    for index, one in enumerate(gaits):
-        if one.name != "bound" or config.bound.horizon != "multiphase":
-            continue
-        for place, phase in enumerate(one.phases):
-            parts = np.ceil(phase.duration / config.multiphase.node_dt - 1e-9)
-            nodes[index, place] = 1 if phase.mode == Mode.FLIGHT else parts
-    return nodes
-
-
 def multiphase_params(
     gaits: list[gait.Gait], config: RunConfig, robot: RobotParams
 ) -> multiphase.MultiPhaseParams:
     """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
     chosen, bound = config.multiphase, config.bound
+    mass, inertia = body_numbers(config, robot)
     return multiphase.MultiPhaseParams(
         nodes=jnp.asarray(cycle_nodes(gaits, config)),
         state_weights=jnp.asarray(chosen.state_weights),
         input_weight=jnp.asarray(chosen.input_weight),
-        mass=jnp.asarray(config.srb.mass),
-        inertia=jnp.asarray(config.srb.inertia * chosen.inertia_scale),
+        mass=jnp.asarray(mass),
+        inertia=jnp.asarray(inertia * chosen.inertia_scale),
         friction=jnp.asarray(chosen.friction),
         torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
         force_x_max=jnp.asarray(chosen.force_x_max),
@@ -291,7 +277,7 @@ def multiphase_params(
     )
 
 
-def _reference_tables(gaits: list[gait.Gait], config: RunConfig) -> Array:
+def _reference_tables(gaits: list[gait.Gait], config: RunConfig, mass: Any, inertia: Any) -> Array:
     """Periodic motion of every gait at every ramp level; zero but for a bound that wants one."""
     bound = config.bound
     levels = 1 + max(g.ramp_cycles for g in gaits)
@@ -306,8 +292,8 @@ def _reference_tables(gaits: list[gait.Gait], config: RunConfig) -> Array:
                 modes,
                 bound.feet_front,
                 bound.feet_rear,
-                config.srb.mass,
-                config.srb.inertia,
+                mass,
+                inertia,
                 bound.force_edge,
             ).rows
             for level in range(levels)

@@ -21,8 +21,9 @@ from kjax.legs.kinematics import PlanarState
 from kjax.mpc import multiphase
 from kjax.mpc.limits import force_limits
 from kjax.mpc.lmpc import LmpcMemory, reference_trajectory, shift_plan, solve_lmpc
-from kjax.params import ControllerParams, build_gaits, cycle_nodes
+from kjax.params import ControllerParams
 from kjax.types import RobotParams
+from kjax.walkable import build_gaits, cycle_nodes
 
 
 class ForceTask(NamedTuple):
@@ -32,14 +33,13 @@ class ForceTask(NamedTuple):
       clock: place in the gait.
       stance: (4,) legs that stand.
       mode: contact mode.
-      body: the robot in the sagittal plane.
-      readable: whether that is what the robot does; else only a safe force is wanted.
-      position: reference of p_x now [m].
+      body: the robot in the sagittal plane, origin on the ground below its centre of mass.
+      valid: whether that is what the robot does; else only a safe force is wanted.
+      lag: reference of p_x less p_x [m].
       velocity: reference of v_x now [m/s].
       command: velocity that the reference is on its way to [m/s].
-      height: of the centre of mass, mean of the stances, above z = 0 [m].
-      ground: height of the ground [m].
-      lean: correction of the pitch reference [rad].
+      height: of the centre of mass above the ground, mean of the stances [m].
+      pitch_offset: correction of the pitch reference [rad].
       memory: of the LMPC within a stance.
     """
 
@@ -47,13 +47,12 @@ class ForceTask(NamedTuple):
     stance: Bool[Array, "4"]
     mode: Int[Array, ""]
     body: PlanarState
-    readable: Bool[Array, ""]
-    position: Float[Array, ""]
+    valid: Bool[Array, ""]
+    lag: Float[Array, ""]
     velocity: Float[Array, ""]
     command: Float[Array, ""]
     height: Float[Array, ""]
-    ground: Float[Array, ""]
-    lean: Float[Array, ""]
+    pitch_offset: Float[Array, ""]
     memory: LmpcMemory
 
 
@@ -61,7 +60,8 @@ class ForcePlan(NamedTuple):
     """What comes back.
 
     Attributes:
-      ends: (2, 2) force (x, z) per standing foot of the front and the rear, now, body frame [N].
+      pair_force: (2, 2) force (x, z) per standing foot of the front and of the rear pair, now, body
+        frame [N].
       memory: of the LMPC within a stance, for the next tick.
       status: a ``qp.Status``.
       residual: of the QP [-].
@@ -69,7 +69,7 @@ class ForcePlan(NamedTuple):
       reference: (6,) state wanted one step ahead.
     """
 
-    ends: Float[Array, "2 2"]
+    pair_force: Float[Array, "2 2"]
     memory: LmpcMemory
     status: Int[Array, ""]
     residual: Float[Array, ""]
@@ -122,10 +122,10 @@ def _build_stance_planner(config: RunConfig) -> Planner:
 
     def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
         clock, body = task.clock, task.body
-        ahead = lmpc.model_dt * jnp.arange(1, lmpc.horizon + 1, dtype=task.position.dtype)
+        ahead = lmpc.model_dt * jnp.arange(1, lmpc.horizon + 1, dtype=task.lag.dtype)
         phase, cycle = (jnp.broadcast_to(a, ahead.shape) for a in (clock.phase, clock.cycle))
         reference = reference_trajectory(
-            position=task.position,
+            position=task.lag,
             velocity=task.velocity,
             height=task.height,
             periodic=_motion(params, task, phase, cycle, clock.elapsed + ahead),
@@ -153,7 +153,7 @@ def _build_stance_planner(config: RunConfig) -> Planner:
         )
         # Out of iterations, the solver's point is feasible and no worse than its start; only
         # faulty data makes the shifted last plan the better choice.
-        usable = (solution.status <= qp.Status.ITERATION_LIMIT) & task.readable
+        usable = (solution.status <= qp.Status.ITERATION_LIMIT) & task.valid
         fallback = jnp.clip(
             shift_plan(task.memory.plan, lmpc),
             params.tables.lower[task.mode],
@@ -161,7 +161,7 @@ def _build_stance_planner(config: RunConfig) -> Planner:
         )
         steps = jnp.where(usable, solution.plan, fallback)
         return ForcePlan(
-            ends=steps[:4].reshape(2, 2),
+            pair_force=steps[:4].reshape(2, 2),
             memory=LmpcMemory(plan=steps, mode=task.mode, warm=solution.warm),
             status=solution.status,
             residual=solution.residual,
@@ -183,12 +183,12 @@ def _build_cycle_planner(config: RunConfig, count: int) -> Planner:
             settings,
             nodes,
             body.x,
-            position=task.position,
+            position=task.lag,
             velocity=task.velocity,
             command=task.command,
             slew=params.command_slew,
             height=task.height,
-            ground=task.ground,
+            ground=jnp.zeros_like(task.lag),
             periodic=_motion(params, task, nodes.phase, nodes.cycle, nodes.place),
             contact=_contacts(params.robot, task) + body.x[:2],
             stance_time=schedule.duration[clock.gait, nodes.phase],
@@ -208,10 +208,10 @@ def _build_cycle_planner(config: RunConfig, count: int) -> Planner:
         # feet carry what they carry in the periodic motion.
         usable = (solved.status <= qp.Status.ITERATION_LIMIT) & (solved.residual < 1e-2)
         carry = jnp.stack([jnp.zeros_like(outlook.force_z[0]), outlook.force_z[0]])
-        force = jnp.where(usable & task.readable, solved.force[0], carry) @ body.rotation
+        force = jnp.where(usable & task.valid, solved.force[0], carry) @ body.rotation
         standing = jnp.arange(2) == nodes.end_index[0]
         return ForcePlan(
-            ends=jnp.where(standing[:, None], force, 0.0),
+            pair_force=jnp.where(standing[:, None], force, 0.0),
             memory=task.memory._replace(plan=jnp.zeros_like(task.memory.plan)),
             status=solved.status,
             residual=solved.residual,
@@ -229,9 +229,9 @@ def _motion(
     cycle: Int[Array, "k"],
     place: Float[Array, "k"],
 ) -> Float[Array, "k 4"]:
-    """Deviation of p_z, theta, v_z, omega that is wanted: the gait's own, and the lean."""
+    """Deviation of p_z, theta, v_z, omega that is wanted: the gait's own, and an offset."""
     rows = periodic_motion(params, task.clock.gait, phase, cycle, place)
-    return rows.at[:, 1].add(task.lean)
+    return rows.at[:, 1].add(task.pitch_offset)
 
 
 def periodic_motion(

@@ -23,6 +23,7 @@ from kjax import RunConfig, load_config, srb  # noqa: E402
 from kjax.config import SrbConfig  # noqa: E402
 from kjax.koopman import open_loop, whole_body  # noqa: E402
 from kjax.koopman.features import affine, clock_history  # noqa: E402
+from kjax.rigid_body import own_body  # noqa: E402
 from kjax.robots import go1  # noqa: E402
 from kjax.sim.batch_loop import BatchEngine  # noqa: E402
 
@@ -76,7 +77,7 @@ episodes = [
 data = whole_body.transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
 train, test = whole_body.split(np.arange(ROBOTS), share=0.33)
 fitted, held = (data.rows(np.isin(data.episode, own)) for own in (train, test))
-config = SrbConfig()
+config = own_body(SrbConfig(), go1.PARAMS)
 body = srb.SrbParams(jnp.asarray(config.mass), jnp.asarray(config.inertia), jnp.zeros((2, 2)))
 models = {"affine": affine, "with clock and last force": clock_history}
 fits = {

@@ -14,9 +14,9 @@ from kjax.config import DatasetConfig, KoopmanConfig, LmpcConfig
 from kjax.koopman import families, prediction, storage
 from kjax.legs.base import build_base
 from kjax.mpc.lmpc import reference_trajectory, solve_lmpc
-from kjax.params import build_gaits
 from kjax.robots import go1
 from kjax.types import Leg, Mode
+from kjax.walkable import build_gaits
 
 STANCE = {
     Mode.TROT: [True, False, False, True],  # the first diagonal

@@ -1,6 +1,5 @@
 """The controller: command, LMPC, gaits, legs."""
 
-from math import inf
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -48,8 +47,9 @@ class LmpcConfig:
     """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
     input_weight: Positive = 1e-5
     """R of every force [1/N^2]."""
-    input_reference: Literal["zero", "hover"] = "zero"
-    """What R penalises the distance from: no force (the paper) or half the weight each [-]."""
+    input_reference: Literal["mean", "zero"] = "mean"
+    """What R penalises the distance from: the gait's mean force, which carries the weight, or no
+    force (the paper), which leaves a droop [-]."""
     force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 60.0
     """Bound of |F_x| per leg, body frame [N]."""
     force_z_min: Bound = 0.0
@@ -57,9 +57,7 @@ class LmpcConfig:
     force_z_max: Bound = 160.0
     """Upper bound of F_z per leg, body frame [N]."""
     height: Positive = 0.27
-    """Reference height of the centre of mass above ground [m]."""
-    height_above: Literal["ground", "feet"] = "ground"
-    """What the reference height is measured from: z = 0, or the stance feet (rough ground) [-]."""
+    """Reference height of the centre of mass above the ground under the stance feet [m]."""
     command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
     """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
     integral_gains: tuple[NonNegative, NonNegative] = (0.0, 0.0)
@@ -78,9 +76,9 @@ class LmpcConfig:
     """Relative KKT residual at which the QP counts as solved; floored by float32's rounding [-]."""
     max_iterations: Count = 2000
     """Iteration limit of the QP [-]."""
-    friction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = inf
-    """mu of rows |F_x| <= mu F_z within a stance, body frame; inf for the paper's box alone [-]."""
-    torque_fraction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = inf
+    friction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 0.6
+    """mu of rows |F_x| <= mu F_z within a stance; inf for the paper's box alone [-]."""
+    torque_fraction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 0.95
     """Part of the joint torque limits that planned forces may take, as rows; inf for none [-]."""
 
     @model_validator(mode="after")
@@ -185,7 +183,7 @@ class MultiPhaseConfig:
     """Lower bound of F_z per leg, world frame [N]."""
     force_z_max: Bound = 340.0
     """Upper bound of F_z per leg, world frame [N]."""
-    friction: Positive = 0.7
+    friction: Positive = 0.6
     """mu of the pyramid |F_x| <= mu F_z; below the ground's, for margin [-]."""
     torque_fraction: Annotated[float, Field(gt=0, le=1)] = 0.95
     """Part of the thigh's and the calf's torque limit that planned forces may take [-]."""
@@ -210,6 +208,12 @@ class MultiPhaseConfig:
 class LegConfig:
     """Swing trajectory, footholds and joint control."""
 
+    act_dt: Positive = 0.001
+    """Time between two calls of act: control_dt is a multiple of it, it is one of sim_dt [s]."""
+    hold_time: NonNegative = 0.02
+    """How long the last torque holds when no valid sample comes [s]."""
+    blind_damping: NonNegative = 2.0
+    """Joint damping that takes its place after that [N m s/rad]."""
     apex: Positive = 0.06
     """Height of the swing above the higher of lift-off and target [m]."""
     horizontal_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
@@ -251,13 +255,7 @@ class LateralConfig:
     """Weights of the wrench (force x, y, z, moment x, y, z) [1/N^2, 1/(N m)^2]."""
     force_weight: Positive = 1e-3
     """Weight of a change of the planned foot forces [1/N^2]."""
-    friction: NonNegative = 0.7
-    """Sideways over vertical force of a foot, at most [-]."""
-    friction_offset: NonNegative = 3.0
-    """Horizontal force allowed beyond that [N]."""
-    plan_friction: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 0.8
-    """The planned F_x is cut at this part of F_z; inf leaves it to the LMPC's box [-]."""
-    plan_friction_bound: Annotated[float, Field(ge=0, allow_inf_nan=True)] = inf
-    """The same in a bound, which loses speed by it: its F_z falls to bound.force_z_min [-]."""
+    friction: NonNegative = 0.6
+    """Horizontal over vertical force of a foot, at most; the LMPC's own where that is less [-]."""
     velocity_gain: NonNegative = 0.05
     """Sideways foothold per sideways velocity, beyond Raibert's law [s]."""

@@ -10,16 +10,18 @@ from kjax.config.checks import STRICT, Count, NonNegative, Positive
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SrbConfig:
-    """Single rigid body that the models are fitted to."""
+    """Single rigid body that the models are fitted to; what is left out is the robot's own."""
 
-    mass: Positive = 12.743
-    """Mass of the body; the Go1's by default [kg]."""
-    inertia: Positive = 0.394
-    """Pitch inertia about the centre of mass; the whole Go1's in its stance by default [kg m^2]."""
-    feet_front: tuple[float, float] = (0.190, -0.250)
-    """Front contact point (x, z) relative to the centre of mass, body frame [m]."""
-    feet_rear: tuple[float, float] = (-0.186, -0.250)
-    """Rear contact point (x, z) relative to the centre of mass, body frame [m]."""
+    mass: Positive | None = None
+    """Mass of the body; the robot's if left out [kg]."""
+    inertia: Positive | None = None
+    """Pitch inertia about the centre of mass; the whole robot's in its stance if left out
+    [kg m^2]."""
+    feet_front: tuple[float, float] | None = None
+    """Front contact point (x, z) relative to the centre of mass, body frame; the sole in the
+    nominal stance if left out [m]."""
+    feet_rear: tuple[float, float] | None = None
+    """Rear contact point (x, z), likewise [m]."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

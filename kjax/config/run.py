@@ -54,7 +54,8 @@ class RunConfig:
 
     @model_validator(mode="after")
     def _check(self) -> "RunConfig":
-        require_multiple("lmpc.control_dt", self.lmpc.control_dt, "sim.sim_dt", self.sim.sim_dt)
+        require_multiple("leg.act_dt", self.leg.act_dt, "sim.sim_dt", self.sim.sim_dt)
+        require_multiple("lmpc.control_dt", self.lmpc.control_dt, "leg.act_dt", self.leg.act_dt)
         require_multiple(
             "lmpc.model_dt", self.lmpc.model_dt, "koopman.dataset.dt", self.koopman.dataset.dt
         )

@@ -26,13 +26,16 @@ class TerrainConfig:
     """Lowest obstacle, or rise of a step [m]."""
     height_max: Positive = 0.07
     """Highest obstacle, or rise of a step [m]."""
-    slope: Annotated[float, Field(gt=0, lt=45)] = 8.0
-    """Inclination of a slope [deg]."""
+    slope: Annotated[float, Field(gt=-45, lt=45)] = 8.0
+    """Inclination of a slope; below 0 it leads down first, from a platform and up to another
+    [deg]."""
     patch_friction: Positive = 0.3
     """Friction of a foot on a patch [-]."""
 
     @model_validator(mode="after")
     def _check(self) -> "TerrainConfig":
+        if self.slope == 0.0:
+            raise ValueError("slope must not be 0 deg; kind = 'flat' is level ground")
         for low, high in (("start", "end"), ("height_min", "height_max")):
             if not getattr(self, low) <= getattr(self, high):
                 raise ValueError(
@@ -101,8 +104,16 @@ class SimConfig:
 
     sim_dt: Positive = 0.001
     """Physics step; torques are recomputed at each [s]."""
-    base: Literal["planar", "free"] = "planar"
-    """Trunk on two slides and a pitch hinge, or free; the controller is built for either [-]."""
+    base: Literal["free", "planar"] = "free"
+    """A free trunk, or one on two slides and a pitch hinge (the paper); the controller is built for
+    either [-]."""
+    start: tuple[float, float] = (0.0, 0.0)
+    """Where the robot starts and the terrain is measured from, world (x, y); x only on the planar
+    base [m]."""
+    heading: float = 0.0
+    """Heading at the start, about which the terrain is turned too; the free base only [rad]."""
+    floor: float = 0.0
+    """Height of the floor [m]."""
     friction: Positive = 0.8
     """Sliding friction coefficient of the feet [-]."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"

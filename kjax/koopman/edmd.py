@@ -215,9 +215,12 @@ def srb_params(
     """Body parameters of every contact mode, stacked on a leading axis.
 
     Args:
-      config: mass, inertia and the contact points of the modes that ``mode_feet`` leaves out.
+      config: mass, inertia and the contact points of the modes that ``mode_feet`` leaves out; from
+        ``rigid_body.own_body``.
       mode_feet: (front, rear) contact points (x, z) of single modes, body frame [m].
     """
+    if config.mass is None or config.inertia is None:
+        raise ValueError("srb.mass and srb.inertia are left out: see rigid_body.own_body")
     feet = np.tile(np.array([config.feet_front, config.feet_rear], float), (len(Mode), 1, 1))
     for mode, points in (mode_feet or {}).items():
         feet[mode] = points

@@ -11,22 +11,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kjax.legs import lateral, spatial, swing
-from kjax.legs.kinematics import PlanarState, planar_state
+from kjax.legs.kinematics import PlanarState, foot_jacobian, planar_state
 from kjax.legs.stance import spatial_stance_torque, stance_torque
 from kjax.types import Observation, RobotParams
 
 
 class View(NamedTuple):
-    """The robot as a base sees it.
+    """The robot as a base sees it, in the frame that its observation's position is given in.
 
     Attributes:
       planar: the sagittal plane, for the LMPC.
-      feet: (4, d) foot centres: (x, z) in the world, or (4, 3) in the track frame [m].
+      feet: (4, d) foot centres: (x, z), or (4, 3) with the axes of the track frame [m].
+      feet_vel: (4, d) their velocity, the same axes [m/s].
+      base_vel: (d,) velocity of the trunk, the same axes [m/s].
       whole: the free robot, ``None`` on the planar base.
     """
 
     planar: PlanarState
     feet: Float[Array, "4 d"]
+    feet_vel: Float[Array, "4 d"]
+    base_vel: Float[Array, "d"]
     whole: spatial.SpatialState | None
 
 
@@ -36,16 +40,30 @@ class LegCommand(NamedTuple):
     Attributes:
       stance: (4,) legs that press.
       force: (4, 2) with what force (x, z), body frame of the sagittal plane [N].
-      swing: where the others are on their way.
-      stance_time: (4,) length of their stance to come [s].
-      velocity: forward velocity wanted [m/s].
+      foot: (4, d) where the feet of the others shall be [m].
+      foot_vel: (4, d) and how fast [m/s].
     """
 
     stance: Bool[Array, "4"]
     force: Float[Array, "4 2"]
-    swing: swing.SwingState
+    foot: Float[Array, "4 d"]
+    foot_vel: Float[Array, "4 d"]
+
+
+class Footing(NamedTuple):
+    """What footholds follow from.
+
+    Attributes:
+      remaining: (4,) time to touchdown [s].
+      stance_time: (4,) length of the stance to come [s].
+      velocity: forward velocity wanted [m/s].
+      ground: height of the ground, frame of the view [m].
+    """
+
+    remaining: Float[Array, "4"]
     stance_time: Float[Array, "4"]
     velocity: Float[Array, ""]
+    ground: Float[Array, ""]
 
 
 class Base(NamedTuple):
@@ -55,12 +73,18 @@ class Base(NamedTuple):
       track: observation at ``init`` -> (2,) cosine and sine of the heading to keep, world; ``None``
         where the base keeps it.
       view: (robot, track, observation) -> view.
+      foothold: (robot, swing and lateral settings of the gait, view, footing) -> next footholds,
+        foot centres (4, d), frame of the view [m].
       torque: (robot, swing and lateral settings of the gait, view, command, observation) ->
         joint torques (4, 3), not yet within the robot's limits [N m].
     """
 
     track: Callable[[Observation], Any]
     view: Callable[[RobotParams, Any, Observation], View]
+    foothold: Callable[
+        [RobotParams, swing.SwingParams, lateral.LateralParams, View, Footing],
+        Float[Array, "4 d"],
+    ]
     torque: Callable[
         [
             RobotParams,
@@ -77,8 +101,12 @@ class Base(NamedTuple):
 def build_base(kind: Literal["planar", "free"]) -> Base:
     """The functions of a base."""
     if kind == "planar":
-        return Base(track=_no_track, view=_planar_view, torque=_planar_torque)
-    return Base(track=spatial.heading, view=_free_view, torque=_free_torque)
+        return Base(
+            track=_no_track, view=_planar_view, foothold=planar_foothold, torque=_planar_torque
+        )
+    return Base(
+        track=spatial.heading, view=_free_view, foothold=_free_foothold, torque=_free_torque
+    )
 
 
 def _no_track(observation: Observation) -> None:
@@ -87,7 +115,25 @@ def _no_track(observation: Observation) -> None:
 
 def _planar_view(robot: RobotParams, track: None, observation: Observation) -> View:
     body = planar_state(robot, observation)
-    return View(planar=body, feet=body.feet, whole=None)
+    lever = body.feet - body.base
+    turning = body.omega * jnp.stack([-lever[:, 1], lever[:, 0]], axis=-1)
+    inside = jnp.einsum("lij,lj->li", foot_jacobian(robot, body.trig), observation.joint_vel[:, 1:])
+    feet_vel = body.base_vel + turning + inside @ body.rotation.T
+    return View(planar=body, feet=body.feet, feet_vel=feet_vel, base_vel=body.base_vel, whole=None)
+
+
+def planar_foothold(
+    robot: RobotParams,
+    settings: swing.SwingParams,
+    sideways: lateral.LateralParams,
+    view: View,
+    footing: Footing,
+) -> Float[Array, "4 2"]:
+    """Next footholds (x, z) in the sagittal plane, foot centres [m]."""
+    along = swing.foothold(
+        robot, settings, view.planar, footing.remaining, footing.stance_time, footing.velocity
+    )
+    return jnp.stack([along, jnp.full_like(along, footing.ground + robot.foot_radius)], axis=-1)
 
 
 def _planar_torque(
@@ -100,10 +146,7 @@ def _planar_torque(
 ) -> Float[Array, "4 3"]:
     """Thigh and calf press or swing; the abduction joints are held at zero."""
     body = view.planar
-    along, _ = _next_step(robot, settings, body, command)
-    target = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=-1)
-    position, velocity = swing.foot_reference(settings, command.swing, target)
-    angle, rate = swing.joint_reference(robot, body, position, velocity)
+    angle, rate = swing.joint_reference(robot, body, command.foot, command.foot_vel)
     follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
     press = stance_torque(robot, body.trig, command.force)
     sagittal = jnp.where(command.stance[:, None], press, follow)
@@ -115,7 +158,38 @@ def _planar_torque(
 
 def _free_view(robot: RobotParams, track: Float[Array, "2"], observation: Observation) -> View:
     body = spatial.spatial_state(robot, track, observation)
-    return View(planar=body.planar, feet=body.feet, whole=body)
+    omega = spatial.turn(body.heading, body.omega)
+    jacobian = spatial.foot_jacobian(robot, body.hip, body.planar.trig)
+    inside = jnp.einsum("lij,lj->li", jacobian, observation.joint_vel)
+    turning = jnp.cross(omega, body.feet - body.base)
+    feet_vel = body.base_vel + turning + inside @ body.rotation.T
+    return View(
+        planar=body.planar, feet=body.feet, feet_vel=feet_vel, base_vel=body.base_vel, whole=body
+    )
+
+
+def _free_foothold(
+    robot: RobotParams,
+    settings: swing.SwingParams,
+    sideways: lateral.LateralParams,
+    view: View,
+    footing: Footing,
+) -> Float[Array, "4 3"]:
+    """Next footholds beside the hips, foot centres [m]."""
+    body = view.whole
+    assert body is not None  # _free_view made it
+    along = swing.foothold(
+        robot, settings, body.planar, footing.remaining, footing.stance_time, footing.velocity
+    )
+    return swing.spatial_foothold(
+        robot,
+        body,
+        along,
+        footing.remaining,
+        footing.stance_time,
+        sideways.foothold_gain,
+        footing.ground,
+    )
 
 
 def _free_torque(
@@ -126,28 +200,17 @@ def _free_torque(
     command: LegCommand,
     observation: Observation,
 ) -> Float[Array, "4 3"]:
-    """All joints press with the regulated forces, or swing to footholds beside the hips."""
+    """All joints press with the regulated forces, or follow the path of a swing."""
     body = view.whole
     assert body is not None  # _free_view made it
-    along, remaining = _next_step(robot, settings, body.planar, command)
-    target = swing.spatial_foothold(
-        robot, body, along, remaining, command.stance_time, sideways.foothold_gain
-    )
-    position, velocity = swing.foot_reference(settings, command.swing, target)
-    angle, rate = swing.spatial_joint_reference(robot, body, position, velocity)
+    angle, rate = swing.spatial_joint_reference(robot, body, command.foot, command.foot_vel)
     follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
     force = lateral.stance_forces(sideways, robot, body, command.stance, command.force)
     press = spatial_stance_torque(robot, body.hip, body.planar.trig, force)
+    # The regulator has changed the plan's forces: the limits of its rows hold for these as well.
+    load = jnp.max(jnp.abs(press) / robot.torque_limit, axis=1, keepdims=True)
+    press = press * jnp.minimum(1.0, sideways.torque_fraction / jnp.maximum(load, 1e-6))
     # A sideways force has nothing to push against before the foot is down: keep the leg upright.
     loose = command.stance & ~observation.contact
     press = press.at[:, 0].set(jnp.where(loose, follow[:, 0], press[:, 0]))
     return jnp.where(command.stance[:, None], press, follow)
-
-
-def _next_step(
-    robot: RobotParams, settings: swing.SwingParams, body: PlanarState, command: LegCommand
-) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Place of each leg's next foothold in the sagittal plane [m], and the time to it [s]."""
-    remaining = jnp.maximum(command.swing.duration - command.swing.elapsed, 0.0)
-    along = swing.foothold(robot, settings, body, remaining, command.stance_time, command.velocity)
-    return along, remaining

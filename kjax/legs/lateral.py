@@ -29,10 +29,9 @@ class LateralParams(NamedTuple):
       damping: of the sideways velocity [N s/m].
       weights: (6,) of the wrench (force x, y, z, moment x, y, z) [1/N^2, 1/(N m)^2].
       ridge: weight of a change of the plan's forces [1/N^2].
-      friction: sideways over vertical force of a foot, at most [-].
-      friction_offset: horizontal force beyond that [N].
-      friction_x: the same of the planned forces; (G,) by gait in the controller's parameters, one
-        number where it is used [-].
+      friction: horizontal over vertical force of a foot, at most; (G,) by gait in the controller's
+        parameters, one number where it is used [-].
+      torque_fraction: part of the joint torque limits that stance forces may take, likewise [-].
       foothold_gain: sideways foothold per sideways velocity, beyond Raibert's law [s].
     """
 
@@ -41,15 +40,16 @@ class LateralParams(NamedTuple):
     damping: Float[Array, ""]
     weights: Float[Array, "6"]
     ridge: Float[Array, ""]
-    friction: Float[Array, ""]
-    friction_offset: Float[Array, ""]
-    friction_x: Float[Array, "*gait"]
+    friction: Float[Array, "*gait"]
+    torque_fraction: Float[Array, "*gait"]
     foothold_gain: Float[Array, ""]
 
 
 def for_gait(params: LateralParams, gait: Int[Array, ""]) -> LateralParams:
     """Settings with those that depend on the gait picked for ``gait``."""
-    return params._replace(friction_x=params.friction_x[gait])
+    return params._replace(
+        friction=params.friction[gait], torque_fraction=params.torque_fraction[gait]
+    )
 
 
 def wrench_map(arms: Float[Array, "4 3"], stance: Bool[Array, "4"]) -> Float[Array, "6 12"]:
@@ -82,7 +82,7 @@ def distribute(
 ) -> Float[Array, "4 3"]:
     """Stance forces (4, 3) [N] near the plan's that give the wrench, as far as feet can push.
 
-    After the least squares, F_z is cut at zero and |F_y| at the friction limit.
+    After the least squares, F_z is cut at zero and the horizontal force at the friction cone.
 
     Args:
       params: weights, ridge and friction.
@@ -100,8 +100,11 @@ def distribute(
     change = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(H), weighted @ missing)
     force = planned + change.reshape(4, 3) * stance[:, None]
     z = jnp.maximum(force[:, 2], 0.0)
-    limit = (params.friction * z + params.friction_offset) * stance
-    return jnp.stack([force[:, 0], jnp.clip(force[:, 1], -limit, limit), z], axis=-1)
+    # Of a pair that slides, one foot lets go first, and the trunk rolls.
+    level = jnp.sqrt(force[:, 0] ** 2 + force[:, 1] ** 2)
+    limit = params.friction * z
+    inside = jnp.where(level > limit, limit / jnp.where(level > limit, level, 1.0), 1.0)
+    return jnp.stack([force[:, 0] * inside, force[:, 1] * inside, z], axis=-1)
 
 
 def stance_forces(
@@ -121,13 +124,7 @@ def stance_forces(
       planned: (4, 2) the LMPC's forces (x, z), body frame of the sagittal plane [N].
     """
     flat = planned @ body.planar.rotation.T
-    endless = jnp.isinf(params.friction_x)  # times no force at all it would be NaN
-    friction = jnp.where(endless, 0.0, params.friction_x) * jnp.maximum(flat[:, 1], 0.0)
-    limit = jnp.where(endless, jnp.inf, friction + params.friction_offset)
-    # The plan's box knows no friction. Of a pair that slides, one foot lets go first, and the
-    # trunk rolls.
-    along = jnp.clip(flat[:, 0], -limit, limit)
-    forces = jnp.stack([along, jnp.zeros_like(along), flat[:, 1]], axis=-1)
+    forces = jnp.stack([flat[:, 0], jnp.zeros_like(flat[:, 0]), flat[:, 1]], axis=-1)
     below = jnp.stack([jnp.zeros_like(body.com[0])] * 2 + [robot.foot_radius])
     arms = turn_back(body.heading, body.feet - below - body.com)
     wrench = wrench_map(arms, stance) @ forces.reshape(-1)

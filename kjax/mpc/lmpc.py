@@ -16,7 +16,7 @@ from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman.models import LinearModel, aggregate, input_map
 from kjax.mpc.condense import cautious_weights, condense
 from kjax.mpc.limits import ForceRows
-from kjax.types import GRAVITY, MODE_ALPHA, Mode
+from kjax.types import MODE_ALPHA, Mode
 
 
 class LmpcTables(NamedTuple):
@@ -80,11 +80,16 @@ class ModeSettings(NamedTuple):
 
 
 def mode_settings(
-    lmpc: LmpcConfig, bound: BoundConfig, mass: float | Float[Array, ""]
+    lmpc: LmpcConfig, bound: BoundConfig, mean_force: Float[Array, "M 2"]
 ) -> ModeSettings:
     """Settings per mode: the bound's own in front and rear stance, the LMPC's elsewhere.
 
     The configs' numbers may be traced.
+
+    Args:
+      lmpc: weights and bounds.
+      bound: those of front and rear stance.
+      mean_force: (M, 2) F_z per front and rear leg that R penalises the distance from [N].
     """
     single = np.isin(np.arange(len(Mode)), [Mode.FRONT, Mode.REAR])[:, None]
     standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
@@ -92,8 +97,7 @@ def mode_settings(
     def chosen(of: Callable[[LmpcConfig | BoundConfig], Sequence[float]]) -> Array:
         return jnp.where(single, jnp.asarray(of(bound), float), jnp.asarray(of(lmpc), float))
 
-    share = np.outer(1.0 / np.maximum(MODE_ALPHA.sum(axis=1), 1), [0.0, 1.0, 0.0, 1.0])
-    hover = share * (0.0 if lmpc.input_reference == "zero" else mass * GRAVITY)
+    hover = jnp.stack([jnp.zeros_like(mean_force), mean_force], axis=-1).reshape(len(Mode), 4)
     lower = chosen(lambda config: [-config.force_x_max, config.force_z_min] * 2)
     upper = chosen(lambda config: [config.force_x_max, config.force_z_max] * 2)
     return ModeSettings(

@@ -49,7 +49,7 @@ def _f(values: Any) -> Array:
 PARAMS = RobotParams(
     mass=_f(_TRUNK_MASS + 4 * _LINK_MASS.sum()),  # 12.743 kg
     # Composite inertia of all links about the common centre of mass, in ``stand_pose(0.27)``.
-    pitch_inertia=_f(0.394),
+    pitch_inertia=_f(0.394350),
     trunk_mass=_f(_TRUNK_MASS),
     trunk_com=_f([0.0223, 0.002, -0.0005]),
     link_mass=_f(_LINK_MASS),

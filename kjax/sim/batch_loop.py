@@ -197,7 +197,9 @@ class _Group:
         self._calls, self._stop, self._dtype = calls, stop, dtype
         self._params, self._case = params, case
         self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-        self._held = torques == "held"
+        per_act = round(config.leg.act_dt / config.sim.sim_dt)
+        # Physics steps that share a torque.
+        self._unit = self._per_tick if torques == "held" else per_act
         self.ticks = ticks_of(config)
         self.done = 0
         models = dressed(model, configs)
@@ -213,10 +215,9 @@ class _Group:
         self._batch.forward()
         self._legs = resolve(model).actuator.reshape(-1)
         self._pushed = bool((case.push_steps > 0).any())
-        unit = self._per_tick if self._held else 1
         # Torques on their way to the joints, a ring of as many as the longest delay.
-        self._ring = np.zeros((1 + int(case.delay.max()) // unit, count, model.nu))
-        self._delay = case.delay // unit
+        self._ring = np.zeros((1 + int(case.delay.max()) // self._unit, count, model.nu))
+        self._delay = case.delay // self._unit
         self.fell_at = np.full(count, self.ticks)
         self.fell = np.zeros(count, bool)
         self._state: Any = None
@@ -236,7 +237,7 @@ class _Group:
         sensed, step = self.sensed(), np.int32(0)
         state = self._calls.init(self._params, self._case, sensed)
         state, *rest = self._calls.first(self._params, self._case, state, step, sensed)
-        if not self._held:
+        if self._unit < self._per_tick:
             state, *rest = self._calls.then(self._params, self._case, state, step, sensed)
         jax.block_until_ready((state, rest))
 
@@ -268,7 +269,7 @@ class _Group:
                 ids = np.flatnonzero(alive)
                 if not len(ids):
                     break
-            for i in range(1 if self._held else self._per_tick):
+            for i in range(0, self._per_tick, self._unit):
                 if i > 0:
                     state, torque = self._calls.then(
                         params, case, state, np.int32(step + i), self.sensed()
@@ -281,20 +282,19 @@ class _Group:
 
     def _apply(self, torque: np.ndarray, step: int) -> None:
         """Torques, delayed, and pushes for the physics steps from ``step`` on."""
-        count = self._per_tick if self._held else 1
         if len(self._ring) > 1:
-            place = step // count
+            place = step // self._unit
             self._ring[place % len(self._ring)] = torque
             when = (place - self._delay) % len(self._ring)
             torque = self._ring[when, np.arange(len(torque))]
         self._ctrl[:] = torque
         if self._pushed:
-            self._pushes[:] = push_at(self._case, step, count)
+            self._pushes[:] = push_at(self._case, step, self._unit)
 
     def _advance(self, ids: np.ndarray | None, alive: np.ndarray) -> None:
         """Physics of the robots that are alive."""
         try:
-            self._batch.step(ids=ids, nstep=self._per_tick if self._held else 1)
+            self._batch.step(ids=ids, nstep=self._unit)
         except mujoco.batch.SimulationError as error:
             # They kept their state: make it one that counts as a fall in the next tick.
             self._qpos[np.asarray(error.ids)] = np.nan
@@ -341,11 +341,12 @@ def ticks_of(config: RunConfig) -> int:
 
 
 def dressed(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.MjModel]:
-    """A copy of the scene for each config's obstacles, friction and payload; equal ones shared."""
+    """A copy of the scene for each config's terrain, floor, friction, payload; equal ones shared."""
     made: dict[Any, mujoco.MjModel] = {}
     out = []
     for config in configs:
-        key = (config.terrain, config.sim.friction, config.sim.payload)
+        sim = config.sim
+        key = (config.terrain, sim.friction, sim.payload, sim.start, sim.heading, sim.floor)
         if key not in made:
             made[key] = copy(model)
             dress(made[key], config.sim, config.terrain)

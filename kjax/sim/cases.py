@@ -26,17 +26,19 @@ from kjax.config import (
     SrbConfig,
     TerrainConfig,
 )
-from kjax.params import ControllerParams, build_gaits, build_params, cycle_nodes
+from kjax.params import ControllerParams, build_params
 from kjax.robots import go1
+from kjax.sim.episode import origin
 from kjax.sim.excitation import force_deviation, without_size
 from kjax.sim.observe import noise_scale
 from kjax.sim.push import impulses
 from kjax.types import Command
+from kjax.walkable import build_gaits, cycle_nodes
 
 # Numbers that reach the compiled functions through ``ControllerParams`` only.
 _LMPC = (
     "state_weights", "input_weight", "input_reference", "force_x_max", "force_z_min",
-    "force_z_max", "height", "height_above", "command_slew", "integral_gains", "integral_limits",
+    "force_z_max", "height", "command_slew", "integral_gains", "integral_limits",
     "position_slack",
 )  # fmt: skip
 _BOUND = (
@@ -62,6 +64,7 @@ class Case(NamedTuple):
       push_steps: (P,) number of steps it lasts; 0 for none.
       push_force: (P, 3) force on the trunk meanwhile, world [N].
       delay: physics steps from a torque's computation to its effect.
+      origin: (3,) where the robot starts, on the floor, world [m].
     """
 
     seed: Any
@@ -71,6 +74,7 @@ class Case(NamedTuple):
     push_steps: Any
     push_force: Any
     delay: Any
+    origin: Any
 
 
 class BatchPart(NamedTuple):
@@ -105,13 +109,21 @@ def batch_part(config: RunConfig) -> BatchPart:
         noise=NoiseConfig(enabled=config.noise.enabled, force=without_size(config.noise)),
         push=PushConfig(),
         srb=SrbConfig(),
-        leg=LegConfig(),
+        leg=LegConfig(act_dt=config.leg.act_dt),
         lateral=LateralConfig(),
         lmpc=_defaults(config.lmpc, _LMPC),
         bound=_defaults(bound, _BOUND),
         multiphase=_defaults(config.multiphase, _MULTIPHASE),
         terrain=TerrainConfig(kind=terrain.kind, count=terrain.count),
-        sim=replace(config.sim, friction=SimConfig().friction, payload=0.0, delay=0.0),
+        sim=replace(
+            config.sim,
+            friction=SimConfig().friction,
+            payload=0.0,
+            delay=0.0,
+            start=(0.0, 0.0),
+            heading=0.0,
+            floor=0.0,
+        ),
     )
     return BatchPart(plain, nodes)
 
@@ -142,6 +154,7 @@ def stack_cases(configs: Sequence[RunConfig]) -> Case:
             push_steps=length,
             push_force=rows,
             delay=np.int32(round(config.sim.delay / dt)),
+            origin=origin(config.sim),
         )
 
     return jax.tree.map(lambda *leaves: np.stack(leaves), *map(one, configs))
@@ -237,10 +250,13 @@ def check_engine(config: RunConfig, *, engine: str = "c", torques: str = "every_
       engine: ``"c"`` or ``"mjx"``.
       torques: ``"every_step"`` or ``"held"``.
     """
-    tick, delay = config.lmpc.control_dt, config.sim.delay
-    if torques == "held" and abs(delay / tick - round(delay / tick)) > 1e-6:
+    held, delay = torques == "held", config.sim.delay
+    name, tick = (
+        ("lmpc.control_dt", config.lmpc.control_dt) if held else ("leg.act_dt", config.leg.act_dt)
+    )
+    if abs(delay / tick - round(delay / tick)) > 1e-6:
         raise ValueError(
-            f"with torques = 'held' sim.delay must be a multiple of lmpc.control_dt {tick} s, got "
+            f"with torques = '{torques}' sim.delay must be a multiple of {name} {tick} s, got "
             f"{delay} s"
         )
     if engine == "mjx" and (config.sim.contacts != "feet" or config.sim.cone != "pyramidal"):

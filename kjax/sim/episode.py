@@ -10,13 +10,20 @@ import numpy as np
 from jaxtyping import Int
 
 from kjax import qp
-from kjax.config import CommandConfig, NoiseConfig, PushConfig, RunConfig, TerrainConfig
+from kjax.config import (
+    CommandConfig,
+    NoiseConfig,
+    PushConfig,
+    RunConfig,
+    SimConfig,
+    TerrainConfig,
+)
 from kjax.legs.base import build_base
-from kjax.params import build_gaits
 from kjax.robots import go1
 from kjax.sim import free_base
 from kjax.sim.excitation import without_size
 from kjax.sim.observe import NOISE_DIM, Observe, noise_dim, noise_scale
+from kjax.walkable import build_gaits
 
 FALL_HEIGHT = 0.12  # m, centre of mass; about the trunk lying on the ground
 FALL_TILT = 1.0  # rad, pitch or roll
@@ -33,8 +40,9 @@ class Trajectory:
       time: [s].
       qpos: (N, nq) positions of the model.
       qvel: (N, nv) velocities of the model.
-      x: (N, 6) true SRB state of the whole-body centre of mass [m, rad, m/s, rad/s].
-      feet: (N, 4, 2) foot centres (x, z), world, or the plane of a free base's heading [m].
+      x: (N, 6) true SRB state of the whole-body centre of mass, from the start on the floor
+        [m, rad, m/s, rad/s].
+      feet: (N, 4, 2) foot centres (x, z), likewise, in the plane of a free base's heading [m].
       foot_force: (N, 4) normal force on the contact sensors [N].
       torque: (N, 4, 3) joint torques commanded (abduction, thigh, calf) [N m].
       gait: (N,) index of the gait, order of ``controller.build_gaits``.
@@ -100,8 +108,9 @@ def fixed_part(config: RunConfig) -> RunConfig:
     """The config without what may differ between the episodes of one compiled simulation.
 
     That is the seed, duration, noise (but for whether it perturbs forces), pushes, times and speeds
-    of the command, times of the gaits, friction, payload, delay, and the terrain's seed and sizes.
-    Configs with the same fixed part share a ``mujoco_loop.Simulation``.
+    of the command, times of the gaits, friction, payload, delay, place and heading of the start,
+    and the terrain's seed and sizes. Configs with the same fixed part share a
+    ``mujoco_loop.Simulation``.
     """
     pieces = tuple(map(float, range(len(config.command.times))))
     return replace(
@@ -112,7 +121,15 @@ def fixed_part(config: RunConfig) -> RunConfig:
         push=PushConfig(),
         command=CommandConfig(times=pieces, velocities=pieces),
         gait=replace(config.gait, times=tuple(map(float, range(len(config.gait.times))))),
-        sim=replace(config.sim, friction=1.0, payload=0.0, delay=0.0),
+        sim=replace(
+            config.sim,
+            friction=1.0,
+            payload=0.0,
+            delay=0.0,
+            start=(0.0, 0.0),
+            heading=0.0,
+            floor=0.0,
+        ),
         terrain=TerrainConfig(kind=config.terrain.kind, count=config.terrain.count),
     )
 
@@ -133,6 +150,10 @@ def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.n
         qvel[2] = -spread.initial_pitch_rate * noise.standard_normal()
     if config.sim.base == "free":
         qpos, qvel = free_base.from_planar(qpos, qvel)
+        free_base.turn(qpos, qvel, config.sim.heading)
+        qpos[:3] += [*config.sim.start, config.sim.floor]
+    else:
+        qpos[:2] += [config.sim.start[0], config.sim.floor]
     if (len(qpos), len(qvel)) != (nq, nv):
         raise ValueError(f"sim.base = '{config.sim.base}' has no model of nq {nq} and nv {nv}")
     return qpos, qvel
@@ -168,16 +189,33 @@ def noise_row(seed: Int[jax.Array, ""], step: Int[jax.Array, ""], base: str) -> 
 _noise_rows = jax.jit(jax.vmap(noise_row, in_axes=(None, 0, None)), static_argnums=2)
 
 
-def sagittal(observe: Observe, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def origin(sim: SimConfig) -> np.ndarray:
+    """Where a robot starts, on the floor (3,), world [m]; recorded states are measured from it."""
+    sideways = sim.start[1] if sim.base == "free" else 0.0
+    return np.array([sim.start[0], sideways, sim.floor])
+
+
+def sagittal(
+    observe: Observe, qpos: np.ndarray, qvel: np.ndarray, start: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """True SRB states (N, 6) and feet (N, 4, 2) along a trajectory, without noise.
 
     Of a free base: in the plane of its heading, with the progress along the heading at the start.
+
+    Args:
+      observe: of the model.
+      qpos: (N, nq) positions.
+      qvel: (N, nv) velocities.
+      start: (3,) point that positions are measured from, the world's origin if ``None`` [m].
     """
+    zero = jnp.zeros(3) if start is None else jnp.asarray(start)
     base = build_base("free" if free_base.is_free(qpos) else "planar")
     track = base.track(observe(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]), jnp.zeros(64)))
 
     def one(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        body = base.view(go1.PARAMS, track, observe(qpos, qvel, jnp.zeros(64))).planar
+        seen = observe(qpos, qvel, jnp.zeros(64))
+        seen = seen._replace(base_pos=seen.base_pos - zero)
+        body = base.view(go1.PARAMS, track, seen).planar
         return body.x, body.feet
 
     x, feet = jax.jit(jax.vmap(one))(qpos, qvel)

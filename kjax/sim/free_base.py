@@ -26,6 +26,27 @@ def from_planar(qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.r_[pose, qpos[3:]], np.r_[qvel[0], 0.0, qvel[1], 0.0, qvel[2], 0.0, qvel[3:]]
 
 
+def turn(qpos: np.ndarray, qvel: np.ndarray, yaw: float) -> None:
+    """Turn a free robot about the world's vertical through the origin, in place.
+
+    Args:
+      qpos: (19,) positions.
+      qvel: (18,) velocities; the angular one is in the body and stays.
+      yaw: to the left [rad].
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    for vector in (qpos[:2], qvel[:2]):
+        vector[:] = c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]
+    half_c, half_s = np.cos(yaw / 2), np.sin(yaw / 2)
+    w, x, y, z = qpos[3:7]
+    qpos[3:7] = (
+        half_c * w - half_s * z,
+        half_c * x - half_s * y,
+        half_c * y + half_s * x,
+        half_c * z + half_s * w,
+    )
+
+
 def attitude(qpos: np.ndarray) -> tuple[Any, Any, Any]:
     """Roll, pitch (nose up positive) and yaw of the trunk, each (...) [rad], for either base."""
     if not is_free(qpos):

@@ -112,6 +112,9 @@ class MjxEngine:
             config, self.model, resolve(self.model).actuator, held=torques == "held"
         )
         self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+        per_act = round(config.leg.act_dt / config.sim.sim_dt)
+        # Physics steps that share a torque.
+        self._unit = self._per_tick if torques == "held" else per_act
         self._calls: dict[Any, tuple[Callable[..., Any], Callable[..., Any]]] = {}
 
     def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
@@ -127,7 +130,7 @@ class MjxEngine:
         models = dressed(self.model, configs)
         case, (own, own_axes) = stack_cases(configs), self._differences(models)
         sensed, warm = self._start(configs, models)
-        delays = 1 + int(case.delay.max()) // (self._per_tick if self.torques == "held" else 1)
+        delays = 1 + int(case.delay.max()) // self._unit
         ticks = ticks_of(configs[0])
         begin_call, walk_call = self._compiled(axes, own_axes, delays)
         place = _sharding(len(configs))
@@ -242,8 +245,8 @@ class MjxEngine:
     def _walk_piece(
         self, params: ControllerParams, own: dict[str, Array], case: Case, state: MjxState
     ) -> tuple[MjxState, MjxTick]:
-        model, walk, per_tick = self._mjx.replace(**own), self._walk, self._per_tick
-        trunk, held = pushed_body(self.model), self.torques == "held"
+        model, walk, unit = self._mjx.replace(**own), self._walk, self._unit
+        trunk = pushed_body(self.model)
 
         def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
             push = push_at(case, step, xp=jnp).astype(self.dtype)
@@ -259,32 +262,28 @@ class MjxEngine:
             if count == 1:
                 return under_way, torque
             under_way = under_way.at[place % count].set(torque)
-            return under_way, under_way[(place - case.delay // (per_tick if held else 1)) % count]
+            return under_way, under_way[(place - case.delay // unit) % count]
 
-        def step(carry: MjxState, _: None) -> tuple[MjxState, Array]:
+        def act(carry: MjxState, _: None) -> tuple[MjxState, Array]:
             data, robot, under_way, at = carry
             robot, torque = walk.act(params, case, robot, at, _sensed(data))
-            under_way, applied = delayed(under_way, torque, at)
-            data = physics(data, applied, at, robot.alive)
-            return MjxState(data, robot, under_way, at + 1), torque
+            under_way, applied = delayed(under_way, torque, at // unit)
+
+            def onward(data: Any, i: Array) -> tuple[Any, None]:
+                return physics(data, applied, at + i, robot.alive), None
+
+            if unit == 1:
+                data = physics(data, applied, at, robot.alive)
+            else:
+                data, _ = jax.lax.scan(onward, data, jnp.arange(unit, dtype=jnp.int32))
+            return MjxState(data, robot, under_way, at + unit), torque
 
         def tick(carry: MjxState, _: None) -> tuple[MjxState, MjxTick]:
             data, robot, under_way, at = carry
             robot, log = walk.plan(params, case, robot, at, _sensed(data))
             carry = MjxState(data, robot, under_way, at)
-            if held:
-                robot, torque = walk.act(params, case, robot, at, _sensed(data))
-                under_way, applied = delayed(under_way, torque, at // per_tick)
-
-                def onward(data: Any, i: Array) -> tuple[Any, None]:
-                    return physics(data, applied, at + i, robot.alive), None
-
-                moved, _ = jax.lax.scan(onward, data, jnp.arange(per_tick, dtype=jnp.int32))
-                after = MjxState(moved, robot, under_way, at + per_tick)
-            else:
-                after, torques = jax.lax.scan(step, carry, None, length=per_tick)
-                torque = torques[0]
-            return after, MjxTick(data.qpos, data.qvel, torque, robot.alive, log)
+            after, torques = jax.lax.scan(act, carry, None, length=self._per_tick // unit)
+            return after, MjxTick(data.qpos, data.qvel, torques[0], robot.alive, log)
 
         return jax.lax.scan(tick, state, None, length=_PIECE)
 

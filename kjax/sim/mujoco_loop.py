@@ -24,6 +24,7 @@ from kjax.sim.episode import (
     fallen,
     fixed_part,
     initial_state,
+    origin,
     sagittal,
     sensor_noise,
 )
@@ -267,6 +268,7 @@ def simulate(
     mujoco.mj_forward(model, data)
 
     per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    per_act = round(config.leg.act_dt / config.sim.sim_dt)
     ticks = -(-round(config.duration / config.sim.sim_dt) // per_tick)
     steps = ticks * per_tick
     # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
@@ -314,18 +316,21 @@ def simulate(
             for i in range(tick * per_tick, (tick + 1) * per_tick):
                 qpos[i], qvel[i] = data.qpos, data.qvel
                 foot_force[i] = data.sensordata[at.foot_force]
-                sense(i)
-                clock = time.perf_counter()
-                state, command = simulation.act(state, sensed)
-                torque[i] = command
-                act_time[i] = time.perf_counter() - clock
+                if i % per_act:
+                    torque[i], act_time[i] = torque[i - 1], act_time[i - 1]
+                else:
+                    sense(i)
+                    clock = time.perf_counter()
+                    state, command = simulation.act(state, sensed)
+                    torque[i] = command
+                    act_time[i] = time.perf_counter() - clock
                 data.ctrl[actuators] = torque[i - delay] if i >= delay else 0.0
                 data.xfrc_applied[pushed, :3] = push[i]
                 mujoco.mj_step(model, data)
                 done = i + 1
             body_contact[tick] = not is_foot_or_world[data.contact.geom].all()
             roll, pitch, _ = free_base.attitude(data.qpos)
-            if fallen(data.subtree_com[trunk, 2], pitch, roll):
+            if fallen(data.subtree_com[trunk, 2] - config.sim.floor, pitch, roll):
                 fell = True
                 break
             if on_tick is not None:
@@ -337,7 +342,7 @@ def simulate(
         raise KeyboardInterrupt  # nothing to keep
 
     keep = slice(0, done)
-    x, feet = sagittal(simulation.observe, qpos[keep], qvel[keep])
+    x, feet = sagittal(simulation.observe, qpos[keep], qvel[keep], origin(config.sim))
     ticks_log = simulation.unpack_log(np.stack(logs))
     held = np.arange(done) // per_tick
     return Trajectory(

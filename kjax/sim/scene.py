@@ -5,7 +5,7 @@ import numpy as np
 
 from kjax.config import SimConfig, TerrainConfig
 from kjax.robots import go1
-from kjax.sim.terrain import add_obstacles, generate, place
+from kjax.sim.terrain import add_obstacles, generate, ground_level, moved, place
 from kjax.types import Leg
 
 _CONES = {
@@ -40,11 +40,12 @@ def build_spec(
         elif config.contacts == "feet":
             geom.contype, geom.conaffinity = 0, 0
     _add_base(spec, config.base)
-    _add_ground(spec, visual)
+    level = 0.0 if terrain is None else ground_level(terrain)
+    _add_ground(spec, config.floor + level, visual)
     if visual:
         _add_looks(spec)
     if terrain is not None:
-        add_obstacles(spec, terrain, config.friction)
+        add_obstacles(spec, terrain, config)
     return spec
 
 
@@ -56,7 +57,7 @@ def build_model(
 
 
 def dress(model: mujoco.MjModel, config: SimConfig, field: TerrainConfig) -> None:
-    """Give a compiled scene another config's obstacles, friction and payload, in place.
+    """Give a compiled scene another config's obstacles, floor, friction and payload, in place.
 
     Raises:
       ValueError: for a field with another number of obstacles.
@@ -64,7 +65,9 @@ def dress(model: mujoco.MjModel, config: SimConfig, field: TerrainConfig) -> Non
     trunk = model.body("trunk").id
     model.body_mass[trunk] = go1.PARAMS.trunk_mass + config.payload
     model.geom_friction[foot_geoms(model), 0] = config.friction
-    place(model, generate(field, config.friction))  # and computes what follows from the mass
+    model.geom_pos[model.geom("ground").id, 2] = config.floor + ground_level(field)
+    # Computes what follows from the mass as well.
+    place(model, moved(generate(field, config.friction), config))
 
 
 def foot_geoms(model: mujoco.MjModel) -> list[int]:
@@ -88,11 +91,12 @@ def _add_base(spec: mujoco.MjSpec, base: str) -> None:
         trunk.add_joint(name=name, type=kind, axis=axis, damping=[0, 0, 0], armature=0)
 
 
-def _add_ground(spec: mujoco.MjSpec, visual: bool) -> None:
+def _add_ground(spec: mujoco.MjSpec, floor: float, visual: bool) -> None:
     """The plane that everything stands on."""
     spec.worldbody.add_geom(
         name="ground",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=[0, 0, floor],
         size=[0, 0, 0.05],
         contype=1,
         conaffinity=0,

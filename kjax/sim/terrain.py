@@ -9,12 +9,13 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from kjax.config import TerrainConfig
+from kjax.config import SimConfig, TerrainConfig
 
 _BOX, _CAPSULE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
 PREFIX = "obstacle_"
 _TRACK = 0.127  # m, half the distance between the left and the right feet
 _WIDE = 0.4  # m, half-width of what reaches across both tracks
+_PLATFORM = 5.0  # m, half-length of what a slope downwards starts from and ends at
 _ACROSS = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # turns a capsule's axis along y
 
 
@@ -39,7 +40,7 @@ def shapes(config: TerrainConfig) -> list[mujoco.mjtGeom]:
     if config.kind == "flat":
         return []
     if config.kind == "slope":
-        return [_BOX] * 3
+        return [_BOX] * 4
     if config.kind == "paper":
         return [_CAPSULE if i % 3 == 2 else _BOX for i in range(config.count)]
     return [_BOX] * config.count
@@ -50,7 +51,7 @@ def generate(config: TerrainConfig, friction: float) -> Terrain:
 
     Kinds: ``paper`` (blocks, cubes and capsules in turn, on the left track, the right one or
     both), ``blocks`` (random blocks on both tracks), ``steps`` (a flight of steps up, then down),
-    ``slope`` (up, level, down), ``patches`` (level, slippery plates).
+    ``slope`` (up, level, down; or down, level, up), ``patches`` (level, slippery plates).
 
     Args:
       config: kind, seed, extent and heights.
@@ -71,9 +72,23 @@ def generate(config: TerrainConfig, friction: float) -> Terrain:
     return Terrain(pos=pos, quat=quat, size=size, friction=mu)
 
 
-def add_obstacles(spec: mujoco.MjSpec, config: TerrainConfig, friction: float) -> None:
+def moved(terrain: Terrain, sim: SimConfig) -> Terrain:
+    """The field seen from the robot's start: turned by its heading, on its floor."""
+    turn = sim.heading if sim.base == "free" else 0.0
+    c, s = np.cos(turn), np.sin(turn)
+    pos = terrain.pos @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    w, x, y, z = terrain.quat.T
+    h_c, h_s = np.cos(turn / 2), np.sin(turn / 2)
+    quat = np.stack(
+        [h_c * w - h_s * z, h_c * x - h_s * y, h_c * y + h_s * x, h_c * z + h_s * w], axis=-1
+    )
+    start = [sim.start[0], sim.start[1] if sim.base == "free" else 0.0, sim.floor]
+    return terrain._replace(pos=pos + start, quat=quat)
+
+
+def add_obstacles(spec: mujoco.MjSpec, config: TerrainConfig, sim: SimConfig) -> None:
     """Add a field's obstacles to a scene that is not compiled yet."""
-    terrain = generate(config, friction)
+    terrain = moved(generate(config, sim.friction), sim)
     for i, shape in enumerate(shapes(config)):
         spec.worldbody.add_geom(
             name=f"{PREFIX}{i}",
@@ -159,18 +174,36 @@ def _steps(config: TerrainConfig, rng: np.random.Generator) -> Field:
     return pos, np.tile(_yaw(0.0), (count, 1)), size
 
 
+def ground_level(config: TerrainConfig) -> float:
+    """Height of the plane that the obstacles lie on, from where the robot starts [m]."""
+    if config.kind != "slope" or config.slope > 0:
+        return 0.0
+    return (config.end - config.start) / 3.0 * np.tan(np.radians(config.slope))
+
+
 def _slope(config: TerrainConfig, rng: np.random.Generator) -> Field:
+    """Up, level, down; or, with a negative slope, down from a platform and up to another one."""
     angle = np.radians(config.slope)
     third = (config.end - config.start) / 3.0
     top, thick = third * np.tan(angle), 0.05
     ramp = 0.5 * third / np.cos(angle)
     pos, quat, size = [], [], []
-    for part, (tilt, height) in enumerate(((-angle, top / 2), (0.0, top), (angle, top / 2))):
-        centre = config.start + third * (part + 0.5)
+
+    def add(centre: float, height: float, tilt: float, half: float) -> None:
         normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
         pos.append(np.array([centre, 0.0, height]) - thick * normal)
         quat.append([np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0])
-        size.append([ramp if tilt else third / 2, _WIDE, thick])
+        size.append([half, _WIDE, thick])
+
+    first, last = config.start + 0.5 * third, config.end - 0.5 * third
+    add(first, top / 2, -angle, ramp)
+    add(last, top / 2, angle, ramp)
+    if angle > 0:
+        add(0.5 * (first + last), top, 0.0, third / 2)
+        add(0.5 * (first + last), top - 3 * thick, 0.0, third / 2)  # inside: both kinds have four
+    else:
+        add(config.start - _PLATFORM, 0.0, 0.0, _PLATFORM)
+        add(config.end + _PLATFORM, 0.0, 0.0, _PLATFORM)
     return np.array(pos), np.array(quat), np.array(size)
 
 

@@ -92,11 +92,11 @@ def build_walk(
       config: any of them.
       model: of the scene; its addresses count.
       actuators: (4, 3) actuator of each joint, a permutation of all.
-      held: whether ``act`` is called once per control tick rather than at each physics step.
+      held: whether ``act`` is called once per control tick rather than every ``leg.act_dt``.
     """
     # The swing legs move on by one of these times with each call of ``act``.
-    act_dt = config.lmpc.control_dt if held else config.sim.sim_dt
-    controller = build_controller(replace(config, sim=replace(config.sim, sim_dt=act_dt)))
+    act_dt = config.lmpc.control_dt if held else config.leg.act_dt
+    controller = build_controller(replace(config, leg=replace(config.leg, act_dt=act_dt)))
     base = build_base(config.sim.base)
     observe = build_observe(model, config.sim.contact_threshold)
     touch = [model.sensor_adr[model.sensor(f"{leg}_foot").id] for leg in ("FR", "FL", "RR", "RL")]
@@ -132,6 +132,7 @@ def build_walk(
             added = case.force_noise * force_row(case.seed, step)
             moved = moved._replace(force=perturb(moved.force, moved.stance, added))
         true = see(sensed)
+        true = true._replace(base_pos=true.base_pos - case.origin.astype(true.base_pos.dtype))
         body = base.view(params.robot, state.track, true).planar
         log = TickLog(
             x=body.x,

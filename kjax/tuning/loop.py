@@ -24,6 +24,7 @@ from kjax.controller import ControllerState, build_controller, next_clock
 from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState
 from kjax.params import ControllerParams
+from kjax.rigid_body import body_numbers
 from kjax.robots import go1
 from kjax.tuning import plant as body_plant
 from kjax.tuning.plant import PlantParams
@@ -133,8 +134,9 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             error = scenario.noise * jax.random.normal(
                 jax.random.fold_in(key, number), (STATE_DIM,), x.dtype
             )
-            feet = _touch_down(params, state, plant, carry, x + error, dt)
-            seen = body_plant.view(robot, plant.com, x + error, feet + error[:2])
+            feet = _touch_down(params, state, plant, carry, x.at[2:].add(error[2:]), dt)
+            measured = x.at[2:].add(error[2:])
+            seen = body_plant.local_view(robot, plant.com, measured, feet)
             always = jnp.ones((), bool)
             state, info = controller.plan_from(params, state, seen, state.stance, always)
             true = body_plant.view(robot, plant.com, x, feet).planar
@@ -168,7 +170,9 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
 
         numbers = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
         feet = _standing(params, plant, scenario.x)
-        state = controller.init_from(params, body_plant.view(robot, plant.com, scenario.x, feet))
+        state = controller.init_from(
+            params, body_plant.local_view(robot, plant.com, scenario.x, feet)
+        )
         none = jnp.zeros_like(feet)
         first = _Carry(scenario.x, feet, state, none, none[0, 0], jnp.ones((), bool))
         _, trace = jax.lax.scan(jax.checkpoint(stretch), first, numbers)
@@ -229,12 +233,16 @@ def _swing(
         state.velocity + state.correction[0],
     )
     target = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
-    place, rate = swing.foot_reference(settings, state.swing, target)
+    # The controller keeps lift-off points relative to the trunk; here everything is in the world.
+    place, rate = swing.foot_path(settings, state.swing, target - body.base)
     standing = state.stance[:, None]
-    never = jnp.zeros((4,), bool)
-    swings = swing.continue_swings(settings, state.swing, ~state.stance, never, feet, dt)
-    moved = jnp.where(standing, feet, place)
-    return moved, jnp.where(standing, 0.0, rate), state._replace(swing=swings)
+    swings = swing.advance(state.swing, ~state.stance, dt)
+    moved = jnp.where(standing, feet, place + body.base)
+    motion = dt * body.base_vel
+    next_state = state._replace(
+        swing=swing.carry_along(swings, motion), ground=state.ground - motion[-1]
+    )
+    return moved, jnp.where(standing, 0.0, rate), next_state
 
 
 class CostWeights(NamedTuple):
@@ -313,9 +321,8 @@ def draw_scenarios(
     bounds = config.gait.names[0] == "bound"
     height = config.bound.height if bounds else config.lmpc.height
     times = np.arange(pieces) * config.duration / pieces
-    nominal = body_plant.nominal_plant(
-        robot, config.srb.mass, config.srb.inertia, config.sim.friction
-    )
+    mass, inertia = body_numbers(config, robot)
+    nominal = body_plant.nominal_plant(robot, mass, inertia, config.sim.friction)
 
     def uniform(size: float) -> np.ndarray:
         return 1.0 + rng.uniform(-size, size, count)

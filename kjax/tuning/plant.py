@@ -112,7 +112,22 @@ def view(
         trig=trig,
         feet=feet,
     )
-    return View(planar=body, feet=feet, whole=None)
+    still = jnp.zeros_like(feet)
+    return View(planar=body, feet=feet, feet_vel=still, base_vel=body.base_vel, whole=None)
+
+
+def local_view(
+    robot: RobotParams, com: Float[Array, "2"], x: Float[Array, "6"], feet: Float[Array, "4 2"]
+) -> View:
+    """``view`` from the trunk's origin, as the controller keeps its points."""
+    seen = view(robot, com, x, feet)
+    body, origin = seen.planar, seen.planar.base
+    return seen._replace(
+        planar=body._replace(
+            x=body.x.at[:2].add(-origin), base=body.base - origin, feet=body.feet - origin
+        ),
+        feet=seen.feet - origin,
+    )
 
 
 def feasible(

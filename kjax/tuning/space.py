@@ -7,7 +7,7 @@ numbers of a controller by the same code that builds them from a config, and may
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from jaxtyping import Array
 from kjax.config import RunConfig, load_config, to_dict
 from kjax.koopman.families import BodyModel
 from kjax.params import ControllerParams, Fits, cast, fit_models, gather
+from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import RobotParams
 
@@ -122,6 +123,7 @@ def build_space(
                 f"keys: '{key}' is a variable of koopman.model 'srb', 'planted' and 'exact' only, "
                 f"whose model it is; got '{config.koopman.model}', which is fitted to data"
             )
+    config = replace(config, srb=own_body(config.srb, robot, config.lmpc.height))
     if fits is None:
         with jax.enable_x64(True):
             fits = fit_models(config, robot)

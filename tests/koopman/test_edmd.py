@@ -8,6 +8,8 @@ import pytest
 from kjax.config import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.koopman import edmd, models, observables
 from kjax.koopman.dataset import Snapshots
+from kjax.rigid_body import own_body
+from kjax.robots import go1
 from kjax.types import MODE_ALPHA, Mode
 
 DT = 1e-3  # s, the step of the shared snapshots
@@ -233,7 +235,9 @@ def test_every_figure_of_the_report_is_a_number_even_for_data_of_zeros(fit_modes
 def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contact_points():
     config = KoopmanConfig(order=1, dataset=DatasetConfig(rollouts=10, duration=0.01))
     bounding = ((0.07, -0.24), (-0.15, -0.25))
-    body = edmd.srb_params(SrbConfig(), {Mode.FRONT: bounding, Mode.REAR: bounding})
+    body = edmd.srb_params(
+        own_body(SrbConfig(), go1.PARAMS), {Mode.FRONT: bounding, Mode.REAR: bounding}
+    )
     model, report = jax.jit(edmd.fit_modes, static_argnames="config")(
         body, config, jax.random.key(0)
     )

@@ -8,6 +8,8 @@ import pytest
 from kjax.config import KoopmanConfig, SrbConfig
 from kjax.koopman import edmd, families, learned, observables, prediction, storage
 from kjax.koopman.dataset import Snapshots
+from kjax.rigid_body import own_body
+from kjax.robots import go1
 from kjax.types import Mode
 
 DT = 1e-3
@@ -109,7 +111,7 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, back.numbers, model)
     config = KoopmanConfig(model="learned", file=str(path))
     assert prediction.build_family(config).size == 8
-    body = edmd.srb_params(SrbConfig())
+    body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
     built = prediction.build_prediction(body, config, jax.random.key(0), height=0.27)
     np.testing.assert_array_equal(built.spread, spread)
 

@@ -10,9 +10,10 @@ from scipy.integrate import solve_ivp
 from kjax import gait
 from kjax.config import BoundConfig, MultiPhaseConfig, RunConfig
 from kjax.mpc import multiphase
-from kjax.params import build_gaits, cycle_nodes, multiphase_params
+from kjax.params import multiphase_params
 from kjax.robots import go1
 from kjax.types import GRAVITY, Leg, Mode
+from kjax.walkable import build_gaits, cycle_nodes
 
 COUNT = 15
 BOUND = 1  # index of the gait

@@ -1,0 +1,102 @@
+"""The rigid body of the prediction: the robot's own, unless a config says otherwise."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from kjax.config import RunConfig, SrbConfig
+from kjax.legs import kinematics
+from kjax.types import GRAVITY, Mode, Observation, RobotParams
+
+
+def own_body(srb: SrbConfig, robot: RobotParams, height: float = 0.27) -> SrbConfig:
+    """The rigid body of a config, the robot's own numbers where it gives none.
+
+    Args:
+      srb: of the config.
+      robot: its mass, inertia and geometry.
+      height: of the centre of mass in the nominal stance [m].
+    """
+    front, rear = nominal_feet(robot, height)
+    return SrbConfig(
+        mass=float(robot.mass) if srb.mass is None else srb.mass,
+        inertia=float(robot.pitch_inertia) if srb.inertia is None else srb.inertia,
+        feet_front=front if srb.feet_front is None else srb.feet_front,
+        feet_rear=rear if srb.feet_rear is None else srb.feet_rear,
+    )
+
+
+def nominal_feet(
+    robot: RobotParams, height: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Soles (x, z) of the front and rear feet from the centre of mass, standing below the hips [m].
+
+    Args:
+      robot: geometry and masses.
+      height: of the centre of mass above the ground [m].
+    """
+    with jax.enable_x64(True):
+        com, hips = _standing_com(robot, height)
+        along = np.asarray(hips[:, 0] - com[0])
+    return (float(along[:2].mean()), -height), (float(along[2:].mean()), -height)
+
+
+@jax.jit
+def _standing_com(robot: RobotParams, height: float) -> tuple[Array, Array]:
+    """Centre of mass (2,) in the trunk frame with the feet below the hips, and the hips (4, 2)."""
+    hips = jnp.asarray(robot.hip_pos[:, ::2], float)
+
+    def again(_: Any, com: Array) -> Array:
+        drop = height - robot.foot_radius - com[1]
+        foot = jnp.stack([jnp.zeros(4), -drop - hips[:, 1]], axis=-1)
+        thigh, calf, _trig = kinematics.inverse(robot, foot)
+        standing = Observation(
+            base_pos=jnp.zeros(3),
+            base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
+            base_vel=jnp.zeros(3),
+            base_ang_vel=jnp.zeros(3),
+            joint_pos=jnp.stack([jnp.zeros(4), thigh, calf], axis=-1),
+            joint_vel=jnp.zeros((4, 3)),
+            contact=jnp.ones(4, bool),
+        )
+        return kinematics.planar_state(robot, standing).x[:2]
+
+    # The legs' share of the centre of mass moves little with the posture: this contracts fast.
+    return jax.lax.fori_loop(0, 20, again, jnp.zeros(2)), hips
+
+
+def body_numbers(config: RunConfig, robot: RobotParams) -> tuple[Any, Any]:
+    """Mass [kg] and pitch inertia [kg m^2] of the prediction; may be traced."""
+    srb = config.srb
+    return (
+        robot.mass if srb.mass is None else srb.mass,
+        robot.pitch_inertia if srb.inertia is None else srb.inertia,
+    )
+
+
+def mean_force(config: RunConfig, mass: Any) -> Float[Array, "M 2"]:
+    """Vertical force of one front and one rear leg in every contact mode, mean of its stance [N].
+
+    In a gait without flight the stance legs share the weight; flights add what they leave out, and
+    the pairs of a bound carry what leaves no net turn. Zero where the config wants the paper's.
+    """
+    chosen, bound = config.gait, config.bound
+    weight = mass * GRAVITY
+    trot = (chosen.stance_time + chosen.trot_flight) / chosen.stance_time
+    cycle = bound.front_stance + bound.first_flight + bound.rear_stance + bound.second_flight
+    levers = bound.feet_front + bound.feet_rear
+    front = 0.5 * cycle / bound.front_stance * bound.feet_rear / levers
+    rear = 0.5 * cycle / bound.rear_stance * bound.feet_front / levers
+    shares = {
+        Mode.FLIGHT: (0.0, 0.0),
+        Mode.FRONT: (front, 0.0),
+        Mode.REAR: (0.0, rear),
+        Mode.TROT: (0.5 * trot, 0.5 * trot),
+        Mode.STAND: (0.25, 0.25),
+    }
+    on = float(config.lmpc.input_reference == "mean")
+    rows = [jnp.stack([jnp.asarray(part, float) for part in shares[mode]]) for mode in Mode]
+    return on * weight * jnp.stack(rows)
