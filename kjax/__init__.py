@@ -8,7 +8,9 @@ The core imports jax, numpy and pydantic only; ``kjax.sim`` needs the extra ``si
 """
 
 from kjax.config import ConfigError, RunConfig, load_config
+from kjax.control_loop import ControlLoop
 from kjax.controller import Controller, build_controller
+from kjax.observation import check_observation
 from kjax.params import ControllerParams, build_params
 from kjax.types import Leg, Mode, Observation
 
@@ -16,6 +18,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ConfigError",
+    "ControlLoop",
     "Controller",
     "ControllerParams",
     "Leg",
@@ -24,5 +27,6 @@ __all__ = [
     "RunConfig",
     "build_controller",
     "build_params",
+    "check_observation",
     "load_config",
 ]

@@ -286,7 +286,16 @@ def save_config(path: Path, config: Any) -> None:
     record = provenance()
     lines = [f"# {key}: {value}" for key, value in record.items() if key != "versions"]
     lines += [f"# {name} {number}" for name, number in record["versions"].items()]
-    write_text(path, "\n".join(lines) + "\n\n" + tomli_w.dumps(to_dict(config)))
+    write_text(path, "\n".join(lines) + "\n\n" + tomli_w.dumps(_without_none(to_dict(config))))
+
+
+def _without_none(data: dict[str, Any]) -> dict[str, Any]:
+    """The data without what is ``None``: TOML has no word for it, and leaves it out."""
+    return {
+        key: _without_none(value) if isinstance(value, dict) else value
+        for key, value in data.items()
+        if value is not None
+    }
 
 
 def save_json(path: Path, data: Any) -> None:

@@ -317,7 +317,9 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
         command = LegCommand(state.stance & ~swings.reaching, state.force, foot, foot_vel)
         torque = base.torque(robot, settings, sideways, view, command, observation)
         blind_time = jnp.where(valid, 0.0, state.blind_time + act_dt)
-        held = jnp.where(blind_time <= params.hold_time, state.torque, _damping(params, joint_vel))
+        held = jnp.where(
+            blind_time < params.hold_time + 0.5 * act_dt, state.torque, _damping(params, joint_vel)
+        )
         torque = jnp.where(valid, torque, held)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
 

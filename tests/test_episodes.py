@@ -12,7 +12,12 @@ from kjax.koopman import storage
 from kjax.sim.episode import fixed_part, metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate
 
-SHORT = {"duration": 0.7, "command.times": [0.0, 0.3], "command.velocities": [0.0, 0.2]}
+SHORT = {
+    "sim.base": "planar",
+    "duration": 0.7,
+    "command.times": [0.0, 0.3],
+    "command.velocities": [0.0, 0.2],
+}
 WALL = {"plan_ms_median", "plan_ms_p99", "act_ms_median", "act_ms_p99", "realtime_factor"}
 
 
@@ -210,6 +215,7 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
         RunConfig,
         None,
         {
+            "sim.base": "planar",
             "duration": 0.7,
             "seed": 4,
             "command.times": [0.0, 0.1],

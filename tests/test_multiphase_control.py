@@ -15,6 +15,7 @@ TIMES = [0.0, 0.4]
 
 def config(**changes):
     chosen = {
+        "sim.base": "planar",
         "gait.names": ["bound", "trot"],
         "gait.times": TIMES,
         "bound.horizon": "multiphase",

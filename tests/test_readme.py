@@ -6,7 +6,7 @@ import jax
 import mujoco
 import numpy as np
 
-from kjax import RunConfig
+from kjax.config import SimConfig
 from kjax.robots import go1
 from kjax.sim.observe import resolve
 from kjax.sim.scene import build_model
@@ -17,24 +17,34 @@ def blocks(repository, language):
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
-def test_the_controller_example_walks_somebody_elses_robot(repository):
-    """The reader's loop: raw MuJoCo here, none of kjax's simulation code but the scene."""
-    code, _, _ = blocks(repository, "python")
-    model = build_model(RunConfig().sim)
+def test_the_controller_examples_walk_somebody_elses_robot(repository):
+    """The reader's loop: raw MuJoCo on a free trunk here, none of kjax's simulation but the scene.
+
+    The ground is not at zero, and the robot looks the other way.
+    """
+    with_loop, bare, _, _ = blocks(repository, "python")
+    floor = -0.27
+    model = build_model(SimConfig(floor=floor))
     at = resolve(model)
     data = mujoco.MjData(model)
     height, joints = go1.stand_pose(0.27)
-    data.qpos[1], data.qpos[3:] = height, joints.reshape(-1)
-    mujoco.mj_forward(model, data)
-    heights = []
+    heights, calls = [], []
+
+    def put_robot_back():
+        mujoco.mj_resetData(model, data)
+        data.qpos[:3] = [40.0, -7.0, height + floor]
+        data.qpos[3:7] = [np.cos(1.2), 0.0, 0.0, np.sin(1.2)]
+        data.qpos[7:] = joints.reshape(-1)
+        mujoco.mj_forward(model, data)
+        heights.clear()
 
     def read_robot():
         trunk = data.body("trunk")
         return {
             "base_pos": trunk.xpos.copy(),
             "base_quat": trunk.xquat.copy(),
-            "base_vel": np.array([data.qvel[0], 0.0, data.qvel[1]]),
-            "base_ang_vel": np.array([0.0, data.qvel[2], 0.0]),
+            "base_vel": data.qvel[:3].copy(),
+            "base_ang_vel": data.qvel[3:6].copy(),
             "joint_pos": data.qpos[at.qpos],
             "joint_vel": data.qvel[at.qvel],
             "contact": data.sensordata[at.foot_force] > 5.0,
@@ -44,18 +54,24 @@ def test_the_controller_example_walks_somebody_elses_robot(repository):
         data.ctrl[at.actuator] = torque
         mujoco.mj_step(model, data)
         mujoco.mj_kinematics(model, data)
-        heights.append(data.qpos[1])
+        heights.append(data.qpos[2] - floor)
+        calls.append(np.array(torque))
 
     scope = {"read_robot": read_robot, "send_torque": send_torque}
     with jax.enable_x64(False):  # the precision that a reader gets without asking
-        exec(code, scope)
-    assert len(heights) == 1000
-    assert 0.25 < min(heights) < max(heights) < 0.31
+        for code in (with_loop, bare):
+            put_robot_back()
+            exec(code, scope)
+            assert len(heights) == 1000
+            assert 0.25 < min(heights) < max(heights) < 0.31
     assert int(scope["info"].status) == 0
+    assert int(scope["loop"].info.status) == 0
+    # Both are the same controller.
+    np.testing.assert_allclose(calls[:1000], calls[1000:], rtol=0, atol=1e-3)
 
 
 def test_the_qp_example_runs_in_the_precision_that_a_reader_has(repository):
-    _, code, _ = blocks(repository, "python")
+    _, _, code, _ = blocks(repository, "python")
     scope = {}
     with jax.enable_x64(False):
         exec(code, scope)
@@ -67,7 +83,7 @@ def test_the_qp_example_runs_in_the_precision_that_a_reader_has(repository):
 
 
 def test_the_models_example_runs(repository):
-    _, _, code = blocks(repository, "python")
+    *_, code = blocks(repository, "python")
     scope = {}
     exec(code, scope)
     assert scope["predicted"].shape == (41, 6)

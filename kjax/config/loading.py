@@ -117,4 +117,4 @@ def _nearest_file(path: Path) -> str:
 
 def to_dict(config: Any) -> dict[str, Any]:
     """The config as nested plain data (lists for tuples), ready for TOML or JSON."""
-    return TypeAdapter(type(config)).dump_python(config, mode="json", exclude_none=True)
+    return TypeAdapter(type(config)).dump_python(config, mode="json")

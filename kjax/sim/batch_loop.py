@@ -341,7 +341,7 @@ def ticks_of(config: RunConfig) -> int:
 
 
 def dressed(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.MjModel]:
-    """A copy of the scene for each config's terrain, floor, friction, payload; equal ones shared."""
+    """A copy of the scene for each config's terrain, floor, friction, payload; equal ones once."""
     made: dict[Any, mujoco.MjModel] = {}
     out = []
     for config in configs:

@@ -8,8 +8,6 @@ import pytest
 from kjax.config import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.koopman import edmd, models, observables
 from kjax.koopman.dataset import Snapshots
-from kjax.rigid_body import own_body
-from kjax.robots import go1
 from kjax.types import MODE_ALPHA, Mode
 
 DT = 1e-3  # s, the step of the shared snapshots
@@ -236,7 +234,8 @@ def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contac
     config = KoopmanConfig(order=1, dataset=DatasetConfig(rollouts=10, duration=0.01))
     bounding = ((0.07, -0.24), (-0.15, -0.25))
     body = edmd.srb_params(
-        own_body(SrbConfig(), go1.PARAMS), {Mode.FRONT: bounding, Mode.REAR: bounding}
+        SrbConfig(mass=10.0, inertia=0.3, feet_front=(0.2, -0.3), feet_rear=(-0.1, -0.3)),
+        {Mode.FRONT: bounding, Mode.REAR: bounding},
     )
     model, report = jax.jit(edmd.fit_modes, static_argnames="config")(
         body, config, jax.random.key(0)
@@ -244,11 +243,11 @@ def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contac
     assert model.A.shape == (len(Mode), 9, 9)
     assert np.asarray(report.finite).all()
     for mode in Mode:
-        own = bounding if mode in (Mode.FRONT, Mode.REAR) else ((0.190, -0.250), (-0.186, -0.250))
+        own = bounding if mode in (Mode.FRONT, Mode.REAR) else ((0.2, -0.3), (-0.1, -0.3))
         (x_f, z_f), (x_r, z_r) = own
         alpha, arms = np.repeat(MODE_ALPHA[mode], 2), np.array([-z_f, x_f, -z_r, x_r])
         # Exact but for rounding, as above.
-        np.testing.assert_allclose(model.B[mode, 6], DT * alpha * arms / 0.394, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(model.B[mode, 6], DT * alpha * arms / 0.3, rtol=0, atol=1e-15)
 
 
 def test_bodies_of_all_modes_differ_in_their_contact_points_only():

@@ -10,6 +10,8 @@ import pytest
 from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.koopman import dataset, edmd, families, observables, prediction
 from kjax.koopman.dataset import Snapshots
+from kjax.rigid_body import own_body
+from kjax.robots import go1
 
 DT = 2e-3  # s
 
@@ -179,7 +181,7 @@ def test_no_samples_or_too_few_are_a_sentence_before_a_fit_and_in_it(data, said)
 @pytest.mark.parametrize(("model", "columns"), [("linear", 19), ("bilinear", 75)])
 def test_a_config_with_too_few_samples_names_its_keys(model, columns):
     config = KoopmanConfig(model=model, dataset=DatasetConfig(rollouts=3, duration=0.005))
-    body = edmd.srb_params(SrbConfig())
+    body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
     fit = {
         "linear": edmd.fit_modes,
         "bilinear": partial(prediction.build_prediction, height=0.27),

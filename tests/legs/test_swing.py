@@ -17,8 +17,19 @@ TARGET = np.array([[0.3, 0.02], [0.15, 0.07], [-0.1, 0.02], [-0.2, 0.05]])
 OFFSET = np.array([0.01, 0.02, -0.03, -0.04])  # m, foothold ahead of the hip
 ROUNDING = {"float32": 1e-6, "float64": 1e-14}  # ten roundings on lengths below 1 m
 
-reference = jax.jit(swing.foot_reference)
-proceed = jax.jit(swing.continue_swings, static_argnames="dt")
+
+def where_feet_shall_be(params, state, target):
+    return swing.held_or_on_path(params, state, *swing.foot_path(params, state, target))
+
+
+def one_step(params, state, swinging, contact, feet, dt):
+    never = jnp.zeros(4, bool)
+    state = swing.advance(state, swinging, dt)
+    return swing.hold_feet(params, state, swinging, contact, contact, never, feet, dt)
+
+
+reference = jax.jit(where_feet_shall_be)
+proceed = jax.jit(one_step, static_argnames="dt")
 joint_reference = jax.jit(swing.joint_reference)
 planar_state = jax.jit(kinematics.planar_state)
 
@@ -78,7 +89,7 @@ def test_position_and_velocity_have_no_jump():
     times = np.linspace(0.0, 1.1 * DURATION, 4001)
     positions, velocities = jax.jit(
         jax.vmap(
-            lambda t: swing.foot_reference(
+            lambda t: where_feet_shall_be(
                 settings(), swinging(0.0)._replace(elapsed=jnp.full(4, t)), jnp.asarray(TARGET)
             )
         )
@@ -173,14 +184,14 @@ def test_a_foot_whose_swing_was_cut_short_sinks_straight_down_until_it_touches()
     np.testing.assert_array_equal(state.reaching, [True, False, False, False])
     air, ground, none = jnp.zeros(4, bool), jnp.ones(4, bool), jnp.zeros(4, bool)
     for _ in range(10):
-        state = swing.continue_swings(params, state, none, air, jnp.asarray(TARGET), 0.001)
-    position, velocity = swing.foot_reference(params, state, jnp.asarray(LIFT_OFF))
+        state = one_step(params, state, none, air, jnp.asarray(TARGET), 0.001)
+    position, velocity = where_feet_shall_be(params, state, jnp.asarray(LIFT_OFF))
     np.testing.assert_allclose(position[0], TARGET[0] + [0.0, 0.03 - 0.8 * 0.01], atol=1e-12)
     np.testing.assert_allclose(velocity[0], [0.0, -0.8])
-    landed = swing.continue_swings(params, state, none, ground, jnp.asarray(TARGET), 0.001)
+    landed = one_step(params, state, none, ground, jnp.asarray(TARGET), 0.001)
     assert not landed.reaching.any()
     # It presses from then on, whatever the contact sensor says.
-    again = swing.continue_swings(params, landed, none, air, jnp.asarray(TARGET), 0.001)
+    again = one_step(params, landed, none, air, jnp.asarray(TARGET), 0.001)
     assert not again.reaching.any()
 
 
@@ -352,7 +363,7 @@ def test_the_state_keeps_its_tree_shapes_and_dtypes_and_traces_once(dtype):
     @chex.assert_max_traces(n=1)
     def tick(state, contact):
         flags = jnp.ones(4, bool)
-        return swing.continue_swings(settings(dtype), state, flags, contact, state.lift_off, 0.001)
+        return one_step(settings(dtype), state, flags, contact, state.lift_off, 0.001)
 
     state = swinging(0.1, dtype)
     for contact in (True, False):

@@ -27,11 +27,12 @@ FREE = LmpcConfig(
     force_x_max=np.inf,
     force_z_min=-np.inf,
     force_z_max=np.inf,
-    input_reference="hover",
     tolerance=1e-11,
 )
 FREE_BOUND = BoundConfig(force_x_max=np.inf, force_z_min=-np.inf, force_z_max=np.inf)
-BOUNDED = LmpcConfig(horizon=4, model_dt=0.005, force_z_min=5.0, tolerance=1e-9)
+BOUNDED = LmpcConfig(
+    horizon=4, model_dt=0.005, force_z_min=5.0, tolerance=1e-9, input_reference="zero"
+)
 # A bound's own weights and bounds, all unlike those of the other modes.
 BOUND = BoundConfig(
     state_weights=(900.0, 1e4, 500.0, 5.0, 2.0, 0.2),
@@ -55,10 +56,12 @@ def here(tables, mode, feet):
 
 
 def build(model, feet, config, bound):
-    """Tables of all modes, with the same contact points in each."""
+    """Tables of all modes, with the same contact points in each; the weight shared or left out."""
+    legs = np.maximum(MODE_ALPHA.sum(axis=1, keepdims=True), 1)
+    wanted = (config.input_reference == "mean") * MASS * G / legs * np.ones((1, 2))
     return condense_all(
         model,
-        lmpc.mode_settings(config, bound, MASS),
+        lmpc.mode_settings(config, bound, jnp.asarray(wanted)),
         steps=round(config.model_dt / DT),
         horizon=config.horizon,
         feet=jnp.tile(feet, (len(Mode), 1, 1)),
@@ -278,29 +281,24 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
 
 
 @pytest.mark.parametrize("mode", list(Mode))
-def test_the_hover_reference_carries_the_weight(mode):
-    settings = lmpc.mode_settings(FREE, FREE_BOUND, MASS)
+def test_the_mean_force_becomes_the_input_reference_of_standing_legs(mode):
+    force = 10.0 + np.arange(10.0).reshape(len(Mode), 2)
+    settings = lmpc.mode_settings(FREE, FREE_BOUND, jnp.asarray(force))
     lower, upper, reference = (
         a[mode].reshape(2, 2) for a in (settings.lower, settings.upper, settings.input_reference)
     )
-    net = MODE_ALPHA[mode] @ reference
-    weight = 0.0 if mode == Mode.FLIGHT else MASS * G
-    np.testing.assert_allclose(net, [0.0, weight], rtol=1e-15)  # one rounding of the division
     standing = MODE_ALPHA[mode] > 0
+    np.testing.assert_array_equal(reference[:, 0], 0.0)
+    np.testing.assert_array_equal(reference[:, 1], np.where(standing, force[mode], 0.0))
     np.testing.assert_array_equal(lower[~standing], 0.0)
     np.testing.assert_array_equal(upper[~standing], 0.0)
     np.testing.assert_array_equal(lower[standing], -np.inf)
     np.testing.assert_array_equal(upper[standing], np.inf)
 
 
-def test_the_zero_input_reference_is_the_default():
-    settings = lmpc.mode_settings(LmpcConfig(), BoundConfig(), MASS)
-    np.testing.assert_array_equal(settings.input_reference, 0.0)
-
-
 @pytest.mark.parametrize("mode", list(Mode))
 def test_front_and_rear_stance_have_the_bound_s_weights_and_limits_and_the_others_their_own(mode):
-    settings = lmpc.mode_settings(BOUNDED, BOUND, MASS)
+    settings = lmpc.mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
     single = mode in (Mode.FRONT, Mode.REAR)
     weights = [900.0, 1e4, 500.0, 5.0, 2.0, 0.2] if single else list(BOUNDED.state_weights)
     np.testing.assert_array_equal(settings.state_weights[mode], weights)
@@ -313,7 +311,7 @@ def test_front_and_rear_stance_have_the_bound_s_weights_and_limits_and_the_other
 
 def test_the_contact_points_of_each_mode_enter_its_own_tables(fitted_moving_feet, body):
     model = fitted_moving_feet[0]
-    settings = lmpc.mode_settings(BOUNDED, BOUND, MASS)
+    settings = lmpc.mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
     arguments = {"steps": 5, "horizon": 4}
     same = jnp.tile(body.feet, (len(Mode), 1, 1))
     moved = same.at[Mode.FRONT, 0, 0].add(0.05)

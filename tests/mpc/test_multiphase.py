@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kjax import gait
-from kjax.config import BoundConfig, MultiPhaseConfig, RunConfig
+from kjax.config import BoundConfig, MultiPhaseConfig, RunConfig, SimConfig
 from kjax.mpc import multiphase
 from kjax.params import multiphase_params
 from kjax.robots import go1
@@ -24,6 +24,7 @@ DURATION = (0.1, 0.1, 0.05, 0.1)  # s
 @pytest.fixture(scope="module")
 def config():
     return RunConfig(
+        sim=SimConfig(base="planar"),
         bound=BoundConfig(
             horizon="multiphase", feet_front=0.05, feet_rear=0.1, velocity_gain=0.075
         ),
@@ -144,7 +145,7 @@ def test_the_predicted_motion_is_the_rigid_bodys_under_the_same_moments(
     force = np.random.default_rng(0).normal(size=(COUNT, 2)) * [40, 100]
     states = np.asarray(free + jnp.einsum("kajf,jf->ka", forced, jnp.asarray(force)))
 
-    m, inertia = 12.743, 0.394 * 0.87
+    m, inertia = float(go1.PARAMS.mass), float(go1.PARAMS.pitch_inertia) * 0.87
     now = np.asarray(x)
     for k in np.flatnonzero(np.asarray(nodes.length) > 0):
         total = force[k] * float(nodes.feet[k])

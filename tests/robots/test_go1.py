@@ -9,6 +9,7 @@ import pytest
 
 from kjax.config import LmpcConfig, SrbConfig
 from kjax.legs.kinematics import KNEE_RANGE
+from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import GRAVITY, Leg
 
@@ -107,8 +108,8 @@ def test_the_composite_pitch_inertia_is_that_of_the_nominal_stance(planar_go1, s
         arm = standing.xipos[i] - com
         total += (R @ np.diag(planar_go1.body_inertia[i]) @ R.T)[1, 1]
         total += planar_go1.body_mass[i] * (arm[0] ** 2 + arm[2] ** 2)
-    # The constant is given to three digits.
-    np.testing.assert_allclose(go1.PARAMS.pitch_inertia, total, rtol=0, atol=1e-3)
+    # The constant is given to a mg m^2.
+    np.testing.assert_allclose(go1.PARAMS.pitch_inertia, total, rtol=0, atol=1e-6)
 
 
 def test_standing_puts_the_feet_on_the_ground_below_the_hips(planar_go1, standing):
@@ -152,21 +153,22 @@ def test_a_refused_height_is_told_the_range_that_works():
 
 
 def test_the_default_rigid_body_is_the_go1():
-    body = SrbConfig()
-    # Given to a gram and to three digits.
-    np.testing.assert_allclose(body.mass, go1.PARAMS.mass, rtol=0, atol=1e-3)
+    body = own_body(SrbConfig(), go1.PARAMS)
+    assert body.mass == go1.PARAMS.mass
     assert body.inertia == go1.PARAMS.pitch_inertia
+    own = own_body(SrbConfig(mass=9.0, feet_rear=(-0.2, -0.25)), go1.PARAMS)
+    assert (own.mass, own.feet_rear) == (9.0, (-0.2, -0.25))
+    assert (own.inertia, own.feet_front) == (body.inertia, body.feet_front)
 
 
 def test_the_default_contact_points_lie_below_the_hips(planar_go1, standing):
-    """Front to back only: the height of the points is the paper's choice."""
-    com = standing.subtree_com[planar_go1.body("trunk").id, 0]
-    body = SrbConfig()
-    # Given to a millimetre.
+    """The soles of MuJoCo's feet, seen from its centre of mass."""
+    com = standing.subtree_com[planar_go1.body("trunk").id]
+    body = own_body(SrbConfig(), go1.PARAMS)
     for point, leg in ((body.feet_front, "FR"), (body.feet_rear, "RR")):
-        np.testing.assert_allclose(
-            point[0], standing.geom(f"{leg}_foot").xpos[0] - com, rtol=0, atol=1e-3
-        )
+        sole = standing.geom(f"{leg}_foot").xpos - com - [0.0, 0.0, go1.FOOT_RADIUS]
+        # The pose is solved to 1e-12 m.
+        np.testing.assert_allclose(point, sole[[0, 2]], rtol=0, atol=1e-10)
 
 
 def test_gravity_is_the_models(model):

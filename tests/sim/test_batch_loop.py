@@ -15,13 +15,13 @@ from kjax.sim.observe import resolve
 pytestmark = pytest.mark.slow
 
 COMMON = {
+    "sim.base": "planar",
     "duration": 0.6,
     "sim.contacts": "feet",
     "terrain.kind": "paper",
     "terrain.count": 3,
     "terrain.start": 0.4,
     "terrain.end": 0.7,
-    "lmpc.height_above": "feet",
 }
 OWN = (
     {},

@@ -18,27 +18,38 @@ from kjax.sim.walk import Sensed, build_walk
 
 def other(value):
     """Another value of the same kind, in its range."""
-    choices = {"zero": "hover", "ground": "feet", "periodic": "constant"}
+    choices = {"mean": "zero", "periodic": "constant"}
     if isinstance(value, str):
         return choices[value]
     if isinstance(value, tuple):
         return tuple(map(other, value))
+    if value is None:
+        return 0.9
     return 0.9 * value if value else 0.1
 
 
 def changed(config):
     """The config with everything else that a batch may vary."""
-    varied = {"friction": 0.5, "payload": 1.0, "delay": 0.01}
+    varied = {"friction": 0.5, "payload": 1.0, "delay": 0.01, "floor": -2.0, "start": (3.0, 0.0)}
     sections = {
         "lmpc": {name: other(getattr(config.lmpc, name)) for name in cases._LMPC},
         "bound": {name: other(getattr(config.bound, name)) for name in cases._BOUND},
         "multiphase": {name: other(getattr(config.multiphase, name)) for name in cases._MULTIPHASE},
-        "leg": {f.name: other(getattr(config.leg, f.name)) for f in dataclasses.fields(config.leg)},
+        "leg": {
+            f.name: other(getattr(config.leg, f.name))
+            for f in dataclasses.fields(config.leg)
+            if f.name != "act_dt"  # shapes the program: a time step of the swings
+        },
         "lateral": {
             f.name: other(getattr(config.lateral, f.name))
             for f in dataclasses.fields(config.lateral)
         },
-        "srb": {f.name: other(getattr(config.srb, f.name)) for f in dataclasses.fields(config.srb)},
+        "srb": {
+            "mass": 11.0,
+            "inertia": 0.3,
+            "feet_front": (0.2, -0.25),
+            "feet_rear": (-0.2, -0.25),
+        },
         "sim": varied,
         "gait": {"stance_time": 0.2, "switch_rule": "anywhere"},
     }

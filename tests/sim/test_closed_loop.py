@@ -6,12 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from kjax.config import RunConfig, load_config
+from kjax.config import RunConfig, SimConfig, load_config
 from kjax.robots import go1
 from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics, sensor_noise
 from kjax.sim.mujoco_loop import build_simulation, simulate
 
 SHORT = {
+    "sim.base": "planar",
     "duration": 1.5,
     "command.times": [0.0, 0.5],
     "command.velocities": [0.0, 0.2],
@@ -112,7 +113,7 @@ def test_a_trajectory_survives_saving(run, tmp_path):
 
 
 def test_noise_of_a_step_does_not_depend_on_the_length_of_the_run():
-    config = RunConfig(seed=3)
+    config = RunConfig(seed=3, sim=SimConfig(base="planar"))
     whole = sensor_noise(config, 50)
     np.testing.assert_array_equal(whole[:20], sensor_noise(config, 20))
     np.testing.assert_array_equal(whole[30:], sensor_noise(config, 20, start=30))
@@ -122,9 +123,7 @@ def test_noise_of_a_step_does_not_depend_on_the_length_of_the_run():
 
 
 def test_the_robot_starts_on_its_feet():
-    config = dataclasses.replace(
-        RunConfig(), noise=dataclasses.replace(RunConfig().noise, enabled=False)
-    )
+    config = load_config(RunConfig, None, {"sim.base": "planar", "noise.enabled": False})
     simulation = build_simulation(config)
     data = mujoco.MjData(simulation.model)
     data.qpos[:], data.qvel[:] = initial_state(config, simulation.model.nq, simulation.model.nv)
@@ -157,7 +156,7 @@ def test_slip_of_a_rolling_foot_is_zero_and_of_a_dragged_one_its_path():
     assert foot_slip(dragged, 1e-3, 5.0) == pytest.approx(0.01, abs=1e-12)
 
 
-IN_PLACE = {"command.times": [0.0], "command.velocities": [0.0]}
+IN_PLACE = {"sim.base": "planar", "command.times": [0.0], "command.velocities": [0.0]}
 
 
 @pytest.fixture(scope="module")

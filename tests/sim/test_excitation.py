@@ -14,7 +14,13 @@ from kjax.sim.episode import fixed_part
 from kjax.sim.excitation import force_noise, force_row, perturb
 from kjax.sim.mujoco_loop import build_simulation, simulate
 
-SHORT = {"duration": 0.3, "sim.contacts": "feet", "noise.force": 12.0, "seed": 5}
+SHORT = {
+    "sim.base": "planar",
+    "duration": 0.3,
+    "sim.contacts": "feet",
+    "noise.force": 12.0,
+    "seed": 5,
+}
 
 
 def config(**keys):

@@ -13,6 +13,7 @@ from kjax.sim import mjx_loop
 from kjax.sim.batch_loop import BatchEngine
 
 COMMON = {
+    "sim.base": "planar",
     "duration": 0.3,
     "sim.contacts": "feet",
     "terrain.kind": "blocks",

@@ -13,7 +13,7 @@ from kjax.types import Leg
 
 @pytest.fixture(scope="module")
 def model():
-    return build_model(SimConfig())
+    return build_model(SimConfig(base="planar"))
 
 
 @pytest.fixture(scope="module")
@@ -104,14 +104,14 @@ def test_no_noise_changes_nothing_and_noise_lands_where_it_should(model, data):
 
 def test_noise_scale_follows_the_config():
     assert (noise_scale(NoiseConfig(enabled=False)) == 0.0).all()
-    scale = noise_scale(NoiseConfig())
+    scale = noise_scale(NoiseConfig(), "planar")
     assert scale.shape == (NOISE_DIM,)
     assert scale[2] == NoiseConfig().pitch
 
 
 def test_the_same_mjcf_gives_a_free_base_with_the_same_robot():
     free = build_model(SimConfig(base="free"))
-    planar = build_model(SimConfig())
+    planar = build_model(SimConfig(base="planar"))
     assert (free.nq, free.nv, free.nu) == (19, 18, 12)
     assert (planar.nq, planar.nv, planar.nu) == (15, 15, 12)
     np.testing.assert_array_equal(free.body_mass, planar.body_mass)

@@ -51,7 +51,12 @@ def test_momentum_of_the_floating_robot_changes_by_the_impulse_whatever_its_join
 
 
 def test_a_push_speeds_the_walking_robot_up_and_it_walks_on():
-    chosen = {"duration": 1.6, "command.times": [0.0], "command.velocities": [0.0]}
+    chosen = {
+        "sim.base": "planar",
+        "duration": 1.6,
+        "command.times": [0.0],
+        "command.velocities": [0.0],
+    }
     chosen |= {"noise.enabled": False}
     calm = load_config(RunConfig, None, chosen)
     pushed = load_config(RunConfig, None, chosen | {"push.times": [0.5], "push.forward": 4.0})
@@ -67,7 +72,9 @@ def test_a_push_speeds_the_walking_robot_up_and_it_walks_on():
 
 def test_a_lateral_push_on_the_planar_robot_and_lists_of_two_lengths_are_refused():
     with pytest.raises(ConfigError, match=r"push\.lateral needs sim\.base = 'free'"):
-        load_config(RunConfig, None, {"push.times": [1.0], "push.lateral": 2.0})
+        load_config(
+            RunConfig, None, {"sim.base": "planar", "push.times": [1.0], "push.lateral": 2.0}
+        )
     with pytest.raises(ConfigError, match=r"forward must be one number or as many as times"):
         load_config(RunConfig, None, {"push.times": [1.0], "push.forward": [2.0, 3.0]})
     with pytest.raises(ConfigError, match=r"push\.duration must be a whole multiple"):

@@ -10,7 +10,9 @@ from kjax.sim import mjx_loop
 from kjax.sim.episode import initial_state
 from kjax.sim.sensitivity import build_sensitivity
 
-CONFIG = load_config(RunConfig, None, {"sim.contacts": "feet", "noise.enabled": False})
+CONFIG = load_config(
+    RunConfig, None, {"sim.base": "planar", "sim.contacts": "feet", "noise.enabled": False}
+)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from kjax.sim import series
 
 @pytest.mark.parametrize("dt", [0.001, 0.005])  # a single run, and one from a batch
 def test_a_series_has_a_sample_every_five_milliseconds(standing_run, tmp_path, dt):
-    config = load_config(RunConfig, None, {"sim.sim_dt": dt, "duration": 1.0})
+    config = load_config(RunConfig, None, {"sim.sim_dt": dt, "leg.act_dt": dt, "duration": 1.0})
     run = standing_run(config, 1.0)
     series.save_series(run, tmp_path / "run.npz")
     kept = series.load_series(tmp_path / "run.npz")

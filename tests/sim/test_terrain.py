@@ -76,14 +76,14 @@ def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
 
 
 def test_a_field_of_another_size_is_refused():
-    model = build_model(SimConfig(), TerrainConfig(kind="paper"))
-    with pytest.raises(ValueError, match="3 obstacles, the scene holds 8"):
+    model = build_model(SimConfig(base="planar"), TerrainConfig(kind="paper"))
+    with pytest.raises(ValueError, match="4 obstacles, the scene holds 8"):
         terrain.place(model, terrain.generate(TerrainConfig(kind="slope"), 0.8))
 
 
 def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
     config = TerrainConfig(kind="slope", slope=10.0)
-    model = build_model(SimConfig(), config)
+    model = build_model(SimConfig(base="planar"), config)
     data = mujoco.MjData(model)
     data.qpos[1] = 5.0  # the robot out of the way
     mujoco.mj_forward(model, data)
@@ -102,10 +102,33 @@ def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
     assert height(1.7) == pytest.approx(0.6 * rise, abs=1e-6)
 
 
+def test_a_slope_downwards_starts_level_and_comes_up_again():
+    config = TerrainConfig(kind="slope", slope=-10.0)
+    model = build_model(SimConfig(base="planar", floor=0.5), config)
+    data = mujoco.MjData(model)
+    data.qpos[1] = 5.0  # the robot out of the way
+    mujoco.mj_forward(model, data)
+
+    def height(x):
+        geom = np.zeros(1, np.int32)
+        down = np.array([0.0, 0.0, -1.0])
+        ray = mujoco.mj_ray(model, data, np.array([x, 0.0, 3.0]), down, None, 1, -1, geom, None)
+        return 3.0 - ray - 0.5
+
+    drop = np.tan(np.radians(10.0))
+    for x in (-1.0, 0.0, 0.79, 2.61, 4.0):
+        assert height(x) == pytest.approx(0.0, abs=1e-6)
+    for x in (0.9, 1.1, 1.3):
+        assert height(x) == pytest.approx(-(x - config.start) * drop, abs=1e-6)
+        mirrored = config.start + config.end - x
+        assert height(mirrored) == pytest.approx(height(x), abs=1e-6)
+    assert height(1.7) == pytest.approx(-0.6 * drop, abs=1e-6)
+
+
 def test_a_patch_is_slippery_under_a_foot():
     """A foot's priority overrules the ground's friction; a patch overrules the foot's."""
     config = TerrainConfig(kind="patches", patch_friction=0.2, start=0.19, end=0.6, count=1)
-    model = build_model(SimConfig(), config)
+    model = build_model(SimConfig(base="planar"), config)
     data = mujoco.MjData(model)
     height, joints = go1.stand_pose(0.27)
     data.qpos[resolve(model).qpos] = joints
@@ -119,8 +142,8 @@ def test_a_patch_is_slippery_under_a_foot():
     assert friction == {True: {0.2}, False: {0.8}}
 
 
-def test_the_height_reference_follows_the_ground_under_the_stance_feet():
-    """Standing on a plateau: without it the robot would sink onto its knees."""
+def test_heights_follow_the_ground_under_the_stance_feet():
+    """Standing on a plateau: measured from the floor the robot would sink onto its knees."""
     rise = 0.06
     common = {
         "duration": 1.0,
@@ -133,25 +156,20 @@ def test_the_height_reference_follows_the_ground_under_the_stance_feet():
         "terrain.height_min": rise,
         "terrain.height_max": rise,
         "noise.enabled": False,
-        "lmpc.input_reference": "hover",
+        "sim.base": "planar",
     }
+    config = load_config(RunConfig, None, common)
+    simulation = build_simulation(config)
+    original = initial_state(config, 15, 15)
+    lifted = original[0].copy()
+    lifted[:2] += 1.0, rise
 
-    def mean_height(above):
-        config = load_config(RunConfig, None, {**common, "lmpc.height_above": above})
-        simulation = build_simulation(config)
-        original = initial_state(config, 15, 15)
-        lifted = original[0].copy()
-        lifted[:2] += 1.0, rise
+    def start(config, nq, nv):
+        return lifted, original[1]
 
-        def start(config, nq, nv):
-            return lifted, original[1]
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("kjax.sim.mujoco_loop.initial_state", start)
-            run = simulate(simulation)
-        assert not run.fell
-        return run.x[-200:, 1].mean()
-
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kjax.sim.mujoco_loop.initial_state", start)
+        run = simulate(simulation)
+    assert not run.fell
     # 5 mm: what is left of the droop under the legs' own weight
-    assert mean_height("feet") == pytest.approx(0.27 + rise, abs=0.005)
-    assert mean_height("ground") < 0.27 + rise - 0.02
+    assert run.x[-200:, 1].mean() == pytest.approx(0.27 + rise, abs=0.005)

@@ -17,6 +17,7 @@ CONFIG = load_config(
     None,
     {
         "duration": 0.5,
+        "sim.base": "planar",
         "gait.names": ["trot", "bound"],
         "gait.times": [0.0, 0.1],
         "gait.stance_time": 0.1,

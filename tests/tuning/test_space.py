@@ -64,8 +64,8 @@ def test_the_mass_of_a_rigid_body_model_is_a_variable_of_its_prediction():
     space = build_space(config, ["srb.mass", "srb.inertia"])
     heavier = {**space.start, "srb.mass": space.start["srb.mass"] + jnp.log(2.0)}
     body = space.params(heavier).prediction.numbers.body
-    np.testing.assert_allclose(body.mass, 2.0 * config.srb.mass, rtol=1e-12)
-    np.testing.assert_allclose(body.inertia, config.srb.inertia, rtol=1e-12)
+    np.testing.assert_allclose(body.mass, 2.0 * go1.PARAMS.mass, rtol=1e-12)
+    np.testing.assert_allclose(body.inertia, go1.PARAMS.pitch_inertia, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,102 @@
+"""The controller for a caller's own loop: it owns the jitted calls and the clock.
+
+``Controller`` is a record of pure functions for ``jit``, ``scan`` and ``vmap``. ``ControlLoop`` is
+for a host that has one robot, samples it and sends torques: it decides when to plan, looks at the
+first sample, and says so when it is called at another rate than the controller was built for.
+"""
+
+import warnings
+from math import inf
+
+import jax
+import numpy as np
+
+from kjax.controller import Controller, ControllerState, PlanInfo
+from kjax.observation import check_shapes
+from kjax.params import ControllerParams
+from kjax.types import Observation
+
+PERIOD_TOLERANCE = 0.2  # relative error of the mean period that is told
+PERIOD_CALLS = 20  # calls that the mean is taken over
+
+
+class ControlLoop:
+    """One robot's controller, called once per ``act_dt``.
+
+    Attributes:
+      params: numbers of the controller; replace it at any time, e.g. for another command.
+      state: of the controller; ``None`` before the first call.
+      info: of the last plan; ``None`` before the first call.
+    """
+
+    def __init__(self, controller: Controller, params: ControllerParams):
+        """The loop before its first sample; nothing is compiled yet.
+
+        Args:
+          controller: from ``build_controller``.
+          params: from ``build_params``.
+        """
+        self.params = params
+        self.state: ControllerState | None = None
+        self.info: PlanInfo | None = None
+        self._controller = controller
+        self._plan, self._act = jax.jit(controller.plan), jax.jit(controller.act)
+        self._next_plan = self._last = -inf
+        self._periods: list[float] = []
+        self._told = False
+
+    def reset(self) -> None:
+        """Forget the robot: the next call begins anew."""
+        self.state = self.info = None
+        self._next_plan = self._last = -inf
+        self._periods = []
+
+    def step(self, observation: Observation, time: float) -> np.ndarray:
+        """Torques (4, 3) of abduction, thigh and calf, legs FR, FL, RR, RL [N m].
+
+        Args:
+          observation: of the robot now.
+          time: now, on any clock that runs on [s].
+
+        Raises:
+          ValueError: for an observation of the wrong shape or type, a first one in another
+            convention (``observation.check_observation``), and a time that does not run on.
+
+        Warns:
+          UserWarning: once, if the mean time between calls is not the controller's ``act_dt``.
+        """
+        check_shapes(observation)
+        if not np.isfinite(time) or time <= self._last:
+            raise ValueError(
+                f"time must run on from {self._last:g} s, got {time:g} s; after a restart of the "
+                "robot call reset()"
+            )
+        if self.state is None:
+            self.state = self._controller.init(self.params, observation)
+            self._next_plan = time
+        else:
+            self._watch(time - self._last)
+        self._last = time
+        if time >= self._next_plan - 0.5 * self._controller.act_dt:
+            self.state, self.info = self._plan(self.params, self.state, observation)
+            late = time - self._next_plan > self._controller.control_dt
+            start = time if late else self._next_plan
+            self._next_plan = start + self._controller.control_dt
+        self.state, torque = self._act(self.params, self.state, observation)
+        return np.asarray(torque)
+
+    def _watch(self, period: float) -> None:
+        """Tell once of another period than the legs' paths are timed for."""
+        if self._told:
+            return
+        self._periods = [*self._periods[1 - PERIOD_CALLS :], period]
+        mean, wanted = float(np.mean(self._periods)), self._controller.act_dt
+        if len(self._periods) < PERIOD_CALLS or abs(mean / wanted - 1.0) <= PERIOD_TOLERANCE:
+            return
+        self._told = True
+        warnings.warn(
+            f"the loop is called every {1e3 * mean:.3g} ms, the controller was built for "
+            f"{1e3 * wanted:.3g} ms: swing legs run at the wrong speed; set leg.act_dt = "
+            f"{mean:.4g} or change the rate",
+            stacklevel=3,
+        )

@@ -1,0 +1,106 @@
+"""A caller's own loop: when it plans, what it refuses, what it tells."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kjax.control_loop import PERIOD_CALLS, ControlLoop
+from kjax.controller import Controller
+from kjax.robots import go1
+from kjax.types import Observation
+
+
+class Stub:
+    """A controller that counts; the loop's own logic needs no walking robot."""
+
+    def __init__(self, control_dt=0.005, act_dt=0.001):
+        self.inits, self.control_dt, self.act_dt = 0, control_dt, act_dt
+
+    def record(self):
+        def init(params, observation):
+            self.inits += 1
+            return {"plans": jnp.zeros(()), "acts": jnp.zeros(())}
+
+        def plan(params, state, observation):
+            return state | {"plans": state["plans"] + 1}, state["plans"] + 1
+
+        def act(params, state, observation):
+            return state | {"acts": state["acts"] + 1}, jnp.full((4, 3), state["plans"])
+
+        return Controller(
+            init=init, plan=plan, act=act, step=None, init_from=None, plan_from=None,
+            control_dt=self.control_dt, act_dt=self.act_dt,
+        )  # fmt: skip
+
+
+def sample(**changes):
+    height, joints = go1.stand_pose(0.27)
+    values = {
+        "base_pos": [0.0, 0.0, height],
+        "base_quat": [1.0, 0.0, 0.0, 0.0],
+        "base_vel": np.zeros(3),
+        "base_ang_vel": np.zeros(3),
+        "joint_pos": joints,
+        "joint_vel": np.zeros((4, 3)),
+        "contact": np.ones(4, bool),
+    }
+    return Observation(**(values | changes))
+
+
+def loop_of(stub):
+    return ControlLoop(stub.record(), None)
+
+
+def test_it_plans_at_the_control_rate_whatever_clock_it_is_given():
+    for start in (0.0, 1.7e9 * 1e-3):  # a computer's uptime
+        loop = loop_of(Stub())
+        plans = [loop.step(sample(), start + 0.001 * i)[0, 0] for i in range(20)]
+        assert plans == [1] * 5 + [2] * 5 + [3] * 5 + [4] * 5
+
+
+def test_after_a_pause_it_plans_at_once_and_goes_on_at_its_rate():
+    loop = loop_of(Stub())
+    for i in range(4):
+        loop.step(sample(), 0.001 * i)
+    plans = [loop.step(sample(), 1.0 + 0.001 * i)[0, 0] for i in range(10)]
+    assert plans == [2] * 5 + [3] * 5
+
+
+@pytest.mark.parametrize("time", [0.003, 0.002, np.nan])
+def test_a_time_that_does_not_run_on_is_refused(time):
+    loop = loop_of(Stub())
+    loop.step(sample(), 0.003)
+    with pytest.raises(ValueError, match=r"time must run on from 0\.003 s, got .* reset\(\)"):
+        loop.step(sample(), time)
+    loop.reset()
+    assert loop.step(sample(), 0.0)[0, 0] == 1
+
+
+def test_another_rate_than_the_controllers_is_told_once():
+    loop = loop_of(Stub())
+    for i in range(PERIOD_CALLS):
+        loop.step(sample(), 0.005 * i)
+    with pytest.warns(UserWarning, match=r"every 5 ms, .* built for 1 ms.*leg\.act_dt = 0\.005"):
+        loop.step(sample(), 0.005 * PERIOD_CALLS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for i in range(PERIOD_CALLS + 1, 3 * PERIOD_CALLS):
+            loop.step(sample(), 0.005 * i)
+
+
+def test_a_jittering_clock_is_not_complained_of():
+    loop, rng = loop_of(Stub()), np.random.default_rng(0)
+    times = np.cumsum(0.001 * rng.uniform(0.5, 1.5, 200))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for time in times:
+            loop.step(sample(), time)
+
+
+def test_a_wrong_shape_is_refused_at_every_call():
+    loop = loop_of(Stub())
+    loop.step(sample(), 0.0)
+    with pytest.raises(ValueError, match=r"observation\.joint_pos: got shape \(12,\), wanted"):
+        loop.step(sample(joint_pos=np.zeros(12)), 0.001)
