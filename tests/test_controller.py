@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kjax import Observation, RunConfig, build_controller, build_params, load_config, qp
-from kjax.config import DatasetConfig, KoopmanConfig, LmpcConfig
+from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, LmpcConfig
 from kjax.koopman import families, prediction, storage
 from kjax.legs.base import build_base
 from kjax.mpc.lmpc import reference_trajectory, solve_lmpc
@@ -631,3 +631,28 @@ def test_a_fit_that_misjudges_forces_is_warned_of_and_a_good_one_is_not(recwarn)
     faulty = dataclasses.replace(config, koopman=KoopmanConfig(feet="measured"))
     with pytest.warns(UserWarning, match=r"trot model predicts for a held force is 4\.9 times"):
         build_params(faulty, go1.PARAMS)
+
+
+def test_a_flag_that_contradicts_the_kinematics_is_told_of_its_leg(controller, params, plan, act):
+    """A leg that presses without contact; its flag comes on again, and is trusted after a while."""
+    silent = standing()._replace(contact=jnp.asarray([False, True, True, True]))
+    state, told = controller.init(params, standing()), []
+    for tick in range(100):
+        seen = silent if tick < 40 else standing()
+        state, info = plan(params, state, seen)
+        told.append(np.asarray(info.contact_fault))
+        for _ in range(5):
+            state, _ = act(params, state, seen)
+    # FR stands in the first 0.25 s; a fault counts from 50 ms on, averaged over 0.5 s.
+    assert not np.any(told[:10])
+    assert told[30].tolist() == [True, False, False, False]
+    assert not np.any(np.asarray(told)[:, 1:])
+
+
+def test_a_key_of_an_earlier_version_is_told_what_has_become_of_it():
+    with pytest.raises(ConfigError, match=r"lmpc\.height_above: .*stance feet"):
+        load_config(RunConfig, None, {"lmpc.height_above": "feet"})
+    with pytest.raises(ConfigError, match=r"lateral\.plan_friction: .*lateral\.friction"):
+        load_config(RunConfig, None, {"lateral.plan_friction": 0.8})
+    with pytest.raises(ConfigError, match=r"lmpc\.input_reference: .*'mean'"):
+        load_config(RunConfig, None, {"lmpc.input_reference": "hover"})

@@ -14,6 +14,17 @@ from pydantic.fields import FieldInfo
 T = TypeVar("T")
 
 
+# What has become of keys of earlier versions.
+RETIRED = {
+    "lmpc.height_above": "is no key any more: heights are measured from the stance feet",
+    "lateral.friction_offset": "is no key any more: lateral.friction bounds the horizontal force",
+    "lateral.plan_friction": "is no key any more: lmpc.friction bounds the plan, lateral.friction "
+    "what is pressed",
+    "lateral.plan_friction_bound": "is no key any more: lmpc.friction and multiphase.friction bound "
+    "the plan, lateral.friction what is pressed",
+}
+
+
 class ConfigError(ValueError):
     """A configuration that cannot be used; the message names file, key, value and wish."""
 
@@ -81,6 +92,8 @@ def _explain(error: ValidationError, cls: type) -> str:
     key = ".".join(loc)
     came = first["input"]
     if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        if key in RETIRED:
+            return f"{key}: {RETIRED[key]}"
         names = {name for name, _, _ in fields(cls)}
         names |= {name.rsplit(".", 1)[0] for name in names if "." in name}
         near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)

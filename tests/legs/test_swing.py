@@ -369,3 +369,42 @@ def test_the_state_keeps_its_tree_shapes_and_dtypes_and_traces_once(dtype):
     for contact in (True, False):
         new = tick(state, jnp.full(4, contact))
         chex.assert_trees_all_equal_shapes_and_dtypes(new, state)
+
+
+def test_a_contact_is_believed_where_the_foot_slows_falls_behind_or_is_on_the_ground():
+    """Legs: on its path in the air; stopped by something; behind its path; on the ground."""
+    place = np.array([[0.1, 0.06], [0.1, 0.06], [0.1, 0.06], [0.1, 0.01]])
+    wanted = place + np.array([[0.0, 0.0], [0.0, 0.0], [0.04, 0.0], [0.0, 0.0]])
+    rate = np.tile([1.0, 0.0], (4, 1))
+    speed = rate * np.array([[1.0], [0.1], [1.0], [1.0]])
+
+    def believed(contact_time, elapsed=0.1):
+        return jax.jit(swing.believable_contact)(
+            jnp.full(4, contact_time), jnp.full(4, elapsed), (place, speed), (wanted, rate), 0.0
+        )
+
+    blocked, denied = believed(0.002)
+    assert blocked.tolist() == [False, True, True, True]
+    assert denied.tolist() == [True, False, False, False]
+    # On since before the lift-off: it says nothing of this swing.
+    assert not believed(0.2)[0].any()
+    assert believed(0.2)[1].tolist() == [True, False, False, False]
+    # Off: nothing to believe.
+    assert not np.any(believed(0.0))
+
+
+def test_a_foot_held_for_a_moment_goes_on_with_its_path():
+    state, none, air = swinging(0.15), jnp.zeros(4, bool), jnp.ones(4, bool)
+    hit = jnp.array([True, True, False, False])
+    feet = jnp.asarray(TARGET)
+    held = swing.hold_feet(settings(), state, air, hit, hit, none, feet, 0.001)
+    assert held.held.tolist() == [True, True, False, False]
+    flicker = jnp.array([True, False, False, False])
+    after = swing.hold_feet(settings(), held, air, none, none, flicker, feet, 0.001)
+    assert after.held.tolist() == [False, True, False, False]
+
+
+def test_points_stay_where_they_are_when_the_frame_moves_on():
+    state = swing.carry_along(swinging(0.1), jnp.array([0.3, -0.1]))
+    # One rounding of a difference.
+    np.testing.assert_allclose(state.lift_off + jnp.array([0.3, -0.1]), LIFT_OFF, atol=1e-15)
