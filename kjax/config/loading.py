@@ -20,8 +20,8 @@ RETIRED = {
     "lateral.friction_offset": "is no key any more: lateral.friction bounds the horizontal force",
     "lateral.plan_friction": "is no key any more: lmpc.friction bounds the plan, lateral.friction "
     "what is pressed",
-    "lateral.plan_friction_bound": "is no key any more: lmpc.friction and multiphase.friction bound "
-    "the plan, lateral.friction what is pressed",
+    "lateral.plan_friction_bound": "is no key any more: lmpc.friction and multiphase.friction "
+    "bound the plan, lateral.friction what is pressed",
 }
 
 
