@@ -137,6 +137,7 @@ def _build_stance_planner(config: RunConfig) -> Planner:
             rows = force_limits(
                 params.robot,
                 body.trig,
+                body.rotation,
                 task.stance,
                 friction=lmpc.friction,
                 torque_fraction=lmpc.torque_fraction,

@@ -28,6 +28,7 @@ class ForceRows(NamedTuple):
 def force_limits(
     robot: RobotParams,
     trig: LegTrig,
+    rotation: Float[Array, "2 2"],
     stance: Bool[Array, "4"],
     *,
     friction: float,
@@ -38,8 +39,9 @@ def force_limits(
     Args:
       robot: joint torque limits.
       trig: posture of the legs.
+      rotation: (2, 2) R_world_body on (x, z): the ground's friction does not pitch with the trunk.
       stance: (4,) legs that stand; an end's rows are those of the mean of its standing legs.
-      friction: mu of |F_x| <= mu F_z; inf leaves these rows out [-].
+      friction: mu of |F_x| <= mu F_z, world frame; inf leaves these rows out [-].
       torque_fraction: part of the limits in |J^T F| <= tau; inf leaves these rows out [-].
     """
     weight = stance.reshape(2, 2).astype(robot.thigh_length.dtype)
@@ -50,7 +52,7 @@ def force_limits(
     for end in range(2):
         place = np.eye(4)[2 * end : 2 * end + 2]  # (x, z) of this end among the four forces
         if isfinite(friction):
-            rows.append(jnp.array([[1.0, -friction], [-1.0, -friction]]) @ place)
+            rows.append(jnp.array([[1.0, -friction], [-1.0, -friction]]) @ rotation @ place)
             low.append(jnp.full((2,), -jnp.inf))
             high.append(jnp.zeros((2,)))
         if isfinite(torque_fraction):

@@ -11,7 +11,7 @@ import pytest
 from kjax import srb
 from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman import models, observables
-from kjax.legs.kinematics import LegTrig
+from kjax.legs.kinematics import LegTrig, leg_trig
 from kjax.mpc import lmpc
 from kjax.mpc.limits import force_limits
 from kjax.qp import Status
@@ -396,7 +396,7 @@ def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bound
 
     def planned(friction, fraction):
         rows = force_limits(
-            go1.PARAMS, posture, stance, friction=friction, torque_fraction=fraction
+            go1.PARAMS, posture, jnp.eye(2), stance, friction=friction, torque_fraction=fraction
         )
         solution = solve(bounded, mode, lift(x), reference, memory(), config=BOUNDED, rows=rows)
         assert solution.status == Status.SOLVED
@@ -414,3 +414,21 @@ def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bound
     _, rows = planned(np.inf, fraction)
     limited, _ = planned(np.inf, fraction)
     assert (np.abs(limited @ rows.A.T) <= rows.high + 1e-6).all()
+
+
+def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():
+    """A vertical force in the world is as far from slipping with the nose up as level."""
+    pitch, mu = 0.4, 0.6
+    c, s = np.cos(pitch), np.sin(pitch)
+    R = np.array([[c, -s], [s, c]])  # nose up: body to world
+    posture = leg_trig(jnp.asarray(go1.stand_pose(0.27)[1]))
+    rows = force_limits(
+        go1.PARAMS, posture, jnp.asarray(R), jnp.ones(4, bool), friction=mu, torque_fraction=np.inf
+    )
+    for world in ([0.0, 100.0], [59.9, 100.0], [-59.9, 100.0]):
+        u = np.tile(R.T @ world, 2)
+        assert (rows.A @ u <= rows.high + 1e-9).all()
+    for world in ([60.1, 100.0], [-60.1, 100.0]):
+        u = np.tile(R.T @ world, 2)
+        # Each end's row is 0.1 N over.
+        np.testing.assert_allclose((rows.A @ u).reshape(2, 2).max(axis=1), 0.1, atol=1e-9)
