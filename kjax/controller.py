@@ -163,7 +163,6 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
     control_dt, act_dt = lmpc.control_dt, config.leg.act_dt
     base = build_base(config.sim.base)
     plan_forces = build_planner(config) if planner is None else planner
-    flicker_time = max(FLICKER, 1.5 * act_dt)
     hessians_stay = config.koopman.feet == "fixed" and config.koopman.model == "linear"
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
@@ -307,7 +306,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
             (foot, foot_vel),
             state.ground + robot.foot_radius,
         )
-        flicker = ~contact & (state.contact_time > 0) & (state.contact_time < flicker_time)
+        flicker = ~contact & (state.contact_time > 0) & (state.contact_time < FLICKER)
         swings = swing.hold_feet(
             settings, swings, ~state.stance, blocked & valid, contact, flicker, view.feet, act_dt
         )
