@@ -4,7 +4,7 @@ Results lie in an ``episodes.Store`` beside those of single runs, under the hash
 how torques are computed; so the same command goes on where it stopped.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,15 @@ from tqdm import tqdm
 from kjax.config import RunConfig
 from kjax.episodes import Record, Store, config_hash
 from kjax.sim.batch_loop import BatchEngine, Torques
+from kjax.sim.episode import Trajectory
+
+Measure = Callable[[Trajectory, RunConfig], dict[str, Any]]
 
 
-def batch_key(config: RunConfig, torques: Torques) -> str:
+def batch_key(config: RunConfig, torques: Torques, dtype: Any = np.float64) -> str:
     """Key of an episode's result in the store."""
-    return f"{config_hash(config)}-{torques}"
+    key = f"{config_hash(config)}-{torques}"
+    return key if np.dtype(dtype) == np.float64 else f"{key}-{np.dtype(dtype).name}"
 
 
 def batch_series_file(store: Store, config: RunConfig, torques: Torques) -> Path:
@@ -35,6 +39,8 @@ def run_batch(
     threads: int | None = None,
     record: Record | None = None,
     recorded: int = 0,
+    measure: Measure | None = None,
+    dtype: Any = np.float64,
     label: str = "",
 ) -> list[dict[str, Any]]:
     """Metrics of the episodes, in order; what the store holds is not run again.
@@ -47,12 +53,14 @@ def run_batch(
       threads: of the engine; one per core if ``None``.
       record: called with a run and the path of a file of its own,
       recorded: for the first so many configs.
+      measure: metrics of a run besides the usual ones; the store's label must tell it apart.
+      dtype: floating type of the controller.
       label: of the progress bar.
 
     Raises:
       KeyboardInterrupt: on Ctrl-C; finished chunks are kept.
     """
-    keys = [batch_key(config, torques) for config in configs]
+    keys = [batch_key(config, torques, dtype) for config in configs]
     files = [batch_series_file(store, config, torques) for config in configs]
     kept = recorded if record is not None else 0
     missing = [
@@ -68,7 +76,7 @@ def run_batch(
         for first in range(0, len(missing), max(size, 1)):
             some = missing[first : first + size]
             if engine is None:
-                engine = BatchEngine(configs[0], torques=torques, threads=threads, dtype=np.float64)
+                engine = BatchEngine(configs[0], torques=torques, threads=threads, dtype=dtype)
             # All chunks have one number of robots, so that one compilation serves them.
             padded = [configs[number] for number in [*some, *[some[-1]] * (size - len(some))]]
             recording = engine.run(padded)
@@ -79,6 +87,9 @@ def run_batch(
                     files[number].parent.mkdir(parents=True, exist_ok=True)
                     record(recording.trajectory(robot), files[number])
             rows = list(recording.metrics())[: len(some)]
+            if measure is not None:
+                for robot, number in enumerate(some):
+                    rows[robot] |= measure(recording.trajectory(robot), configs[number])
             store.add_all({keys[n]: row for n, row in zip(some, rows, strict=True)})
             bar.update(len(some))
     return [store.done[key] for key in keys]
