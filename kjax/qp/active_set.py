@@ -22,15 +22,19 @@ rows, the case of a legged robot, mean few iterations.
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from kjax.qp.batching import where_needed, while_any
+from kjax.qp.batching import while_any
 from kjax.qp.row_problem import RowProblem
 
 
-class _State(NamedTuple):
+ROUNDS = 3  # of steps 2 to 5; one is usual
+
+
+class ActiveSet(NamedTuple):
     """Iterate of the method; M = m + n rows, those of the box last.
 
     Attributes:
@@ -41,9 +45,9 @@ class _State(NamedTuple):
       chosen: row to add.
       sign: of its inward normal.
       pending: whether there is one.
-      infeasible: whether a row cannot be made to hold.
-      farkas: (M,) the multipliers that prove it, along the rows.
-      iterations: spent.
+      infeasible: whether the chosen row cannot be made to hold.
+      rounds: of steps 2 to 5.
+      iterations: rows added and dropped.
     """
 
     stack: Float[Array, "n+M n"]
@@ -54,41 +58,27 @@ class _State(NamedTuple):
     sign: Array
     pending: Array
     infeasible: Array
-    farkas: Float[Array, "M"]
+    rounds: Int[Array, ""]
     iterations: Int[Array, ""]
 
-
-class ActiveSet(NamedTuple):
-    """Outcome of ``solve_active_set``.
-
-    Attributes:
-      x: (n,) point.
-      multipliers: (M,) positive at upper sides.
-      bound_status: (M,) 1 active at the lower side, -1 at the upper one, 0 not active.
-      definite: whether H is positive definite to working precision; else all this is nothing.
-      infeasible: whether a row could not be made to hold.
-      farkas: (M,) multipliers that prove it, positive at upper sides.
-      iterations: rows added and dropped.
-    """
-
-    x: Float[Array, "n"]
-    multipliers: Float[Array, "M"]
-    bound_status: Float[Array, "M"]
-    definite: Array
-    infeasible: Array
-    farkas: Float[Array, "M"]
-    iterations: Int[Array, ""]
+    @property
+    def multipliers(self) -> Float[Array, "M"]:
+        """Multipliers (M,) of the rows, positive at upper sides."""
+        return -self.bound_status * self.y
 
 
 class _Settings(NamedTuple):
     tolerance: float
     max_iterations: int
+    rounding: float
 
 
 def solve_active_set(
-    problem: RowProblem, good: Array, *, tolerance: float, max_iterations: int
-) -> ActiveSet:
-    """Solve the problem; H must be positive definite. Nothing is done if not ``good``.
+    problem: RowProblem, good: Array, tolerance: float, max_iterations: int
+) -> tuple[ActiveSet, Bool[Array, ""]]:
+    """The last iterate, and whether H is positive definite to working precision.
+
+    Where it is not, or the problem is not ``good``, nothing is done.
 
     Args:
       problem: scaled.
@@ -105,10 +95,10 @@ def solve_active_set(
     definite = (jnp.diagonal(factor) > (n * eps) ** 0.5).all()
     factor = jnp.where(definite, factor, jnp.eye(n, dtype=dtype))
     # An inverse, not solves: products are what XLA does fast.
-    half = solve_triangular(factor, jnp.eye(n, dtype=dtype), lower=True) / curvature**0.5
-    inverse = half.T @ half
+    half = solve_triangular(factor, jnp.eye(n, dtype=dtype), lower=True)
+    inverse = half.T @ half / curvature
     zero = jnp.zeros((), jnp.int32)
-    state = _State(  # step 1
+    state = ActiveSet(  # step 1
         stack=jnp.concatenate([inverse, jnp.zeros((M, n), dtype)]),
         x=-(inverse @ problem.q),
         y=jnp.zeros((M,), dtype),
@@ -117,33 +107,52 @@ def solve_active_set(
         sign=jnp.ones((), dtype),
         pending=good & definite,
         infeasible=jnp.zeros((), bool),
-        farkas=jnp.zeros((M,), dtype),
+        rounds=zero,
         iterations=zero,
     )
-    settings = _Settings(max(tolerance, 10.0 * eps), max_iterations)
-    state = _iterate(settings, _choose(settings, state, problem), problem, half)
-    resumed = _choose(settings, state._replace(pending=good & definite), problem)
-    state = where_needed(resumed.pending, partial(_iterate, settings), resumed, problem, half)
-    return ActiveSet(
-        x=state.x,
-        multipliers=-state.bound_status * state.y,
-        bound_status=state.bound_status,
-        definite=definite,
-        infeasible=state.infeasible,
-        farkas=state.farkas,
-        iterations=state.iterations,
+    settings = _Settings(
+        tolerance=max(tolerance, 10.0 * eps),
+        max_iterations=max_iterations,
+        rounding=max(10.0 * eps, min(30.0 * n * eps, 1e-11)),
     )
-
-
-def _iterate(settings: _Settings, state: _State, problem: RowProblem, half: Array) -> _State:
-    """Steps 2 to 4 until no row is violated, then step 5."""
     state = while_any(
-        lambda state: state.pending, partial(_advance, settings), state, problem, half
+        lambda state: state.pending,
+        partial(_round, settings),
+        state,
+        problem,
+        settings.rounding * jnp.max(jnp.diagonal(inverse)),
     )
-    return _polish(problem, _polish(problem, state))
+    return state, definite
 
 
-def _choose(settings: _Settings, state: _State, problem: RowProblem) -> _State:
+def farkas(problem: RowProblem, state: ActiveSet) -> Float[Array, "M"]:
+    """Multipliers (M,) that prove the problem infeasible, if the iterate says that it is.
+
+    The chosen normal is the sum of r times active ones, none of which may give way.
+    """
+    n = problem.q.shape[0]
+    is_chosen = jnp.arange(state.y.shape[0]) == state.chosen
+    r = state.stack[n:] @ (state.sign * problem.adjoint(is_chosen.astype(problem.q.dtype)))
+    given = jnp.where(problem.equal, r, jnp.minimum(r, 0.0))
+    return state.bound_status * given - jnp.where(is_chosen, state.sign, 0.0)
+
+
+def _round(settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array) -> ActiveSet:
+    """Steps 2 to 4 until no row is violated, then step 5: pending again if one is violated now."""
+    found = while_any(
+        lambda state: state.pending,
+        partial(_advance, settings),
+        _choose(settings, state, problem),
+        problem,
+        rounding,
+    )
+    found = _polish(problem, _polish(problem, found))
+    found = found._replace(rounds=state.rounds + 1, pending=state.rounds < ROUNDS - 1)
+    found = _choose(settings, found, problem)
+    return jax.tree.map(lambda new, old: jnp.where(state.pending, new, old), found, state)
+
+
+def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem) -> ActiveSet:
     """Step 2: the row that is violated most."""
     value = problem.rows(state.x)
     inactive = state.bound_status == 0
@@ -166,10 +175,15 @@ def _choose(settings: _Settings, state: _State, problem: RowProblem) -> _State:
         & ~state.infeasible
     )
     sign = jnp.where(below[chosen] >= above[chosen], 1.0, -1.0).astype(value.dtype)
-    return state._replace(chosen=chosen, sign=sign, pending=pending)
+    # What could not be made to hold is kept, for the proof.
+    return state._replace(
+        chosen=jnp.where(state.infeasible, state.chosen, chosen),
+        sign=jnp.where(state.infeasible, state.sign, sign),
+        pending=pending,
+    )
 
 
-def _advance(settings: _Settings, state: _State, problem: RowProblem, half: Array) -> _State:
+def _advance(settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array) -> ActiveSet:
     """Steps 3 and 4: add the chosen row, or drop the one that is in its way; then step 2."""
     n, dtype = problem.q.shape[0], problem.q.dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -189,9 +203,8 @@ def _advance(settings: _Settings, state: _State, problem: RowProblem, half: Arra
     ratio = jnp.where(may_drop, state.y / jnp.where(may_drop, r, 1.0), jnp.inf)
     dropped = jnp.argmin(ratio).astype(jnp.int32)
     t_drop = ratio[dropped]
-    # A row that depends on the active ones moves nothing: rounding alone is left of its curvature
-    # a^T H^-1 a.
-    depends = curvature <= 30.0 * n * eps * jnp.sum((half @ normal) ** 2)
+    # A row that depends on the active ones moves nothing: rounding alone is left of its curvature.
+    depends = curvature <= rounding
     t_add = jnp.where(
         depends, jnp.inf, jnp.maximum(violation, 0.0) / jnp.where(depends, 1.0, curvature)
     )
@@ -219,10 +232,6 @@ def _advance(settings: _Settings, state: _State, problem: RowProblem, half: Arra
     bound_status = jnp.where(drop, bound_status * (1.0 - is_dropped), bound_status)
     y = jnp.where(drop, y * (1.0 - is_dropped), y)
     fails = pending & stuck & ~redundant
-    # The chosen normal is the sum of r times active ones, none of which may give way.
-    farkas = state.bound_status * jnp.where(
-        problem.equal, r, jnp.minimum(r, 0.0)
-    ) - state.sign * is_chosen
     moved = state._replace(
         stack=stack,
         x=x,
@@ -231,7 +240,6 @@ def _advance(settings: _Settings, state: _State, problem: RowProblem, half: Arra
             pending & redundant, bound_status + state.sign * is_chosen, bound_status
         ),
         infeasible=state.infeasible | fails,
-        farkas=jnp.where(fails, farkas, state.farkas),
         iterations=state.iterations + pending,
     )
     chosen = _choose(settings, moved, problem)
@@ -244,7 +252,7 @@ def _advance(settings: _Settings, state: _State, problem: RowProblem, half: Arra
     )
 
 
-def _polish(problem: RowProblem, state: _State) -> _State:
+def _polish(problem: RowProblem, state: ActiveSet) -> ActiveSet:
     """A Newton step of the equations that the active rows make, for what rounding has left."""
     n = problem.q.shape[0]
     P, U = state.stack[:n], state.stack[n:]

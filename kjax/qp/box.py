@@ -280,14 +280,13 @@ def _by_pivoting(
     # around it limits it.
     least = jnp.max(jnp.maximum(jnp.maximum(lower, -upper), 0.0))
     widest = jnp.maximum(jnp.abs(lower), jnp.abs(upper))
-    size_g = jnp.maximum(jnp.max(jnp.abs(q)), least)
-    size_x = jnp.minimum(size_g, jnp.max(widest))
+    size = jnp.maximum(jnp.max(jnp.abs(q)), least)
+    size = jnp.where(jnp.isfinite(size), size, 0.0)
     # Far below the tolerance, which the condition multiplies on its way to x.
     eps = float(jnp.finfo(q.dtype).eps)
     relative = max(10.0 * eps, 1e-3 * tolerance)
     limit = min(settings.max_iterations, 10 * q.shape[0])
-    coarse = jnp.where(jnp.isfinite(size_g), relative * jnp.stack([size_x, size_g]), 0.0)
-    threshold = jnp.broadcast_to(coarse[:, None], (2, q.shape[0]))
+    threshold = relative * jnp.minimum(size, widest), relative * size
 
     box = _Box(prepared.H, q, lower, upper)
     first = pivot(warm.table, warm.side, q, lower, upper, threshold=threshold, limit=limit)
@@ -336,7 +335,7 @@ def _refactorise(
     first: Pivoted,
     table: Array,
     side: Array,
-    threshold: Array,
+    threshold: tuple[Array, Array],
 ) -> _Tried:
     """Polish; if that does not do, pivot from the cold start, and take the better point.
 
@@ -345,12 +344,14 @@ def _refactorise(
     old = _polish(box, _polish(box, tried, first), first)
     corrupted = ~(old.residual <= tolerance)
     widest = jnp.maximum(jnp.abs(box.lower), jnp.abs(box.upper))
-    eps = float(jnp.finfo(threshold.dtype).eps)
+    eps = float(jnp.finfo(box.q.dtype).eps)
     relative = max(10.0 * eps, 1e-3 * tolerance)
-    own = jnp.minimum(threshold, relative * jnp.stack([widest, jnp.abs(box.q)]))
-    own = jnp.maximum(own, eps / relative * threshold)
+    own = tuple(
+        jnp.clip(relative * part, eps / relative * whole, whole)
+        for part, whole in zip((widest, jnp.abs(box.q)), threshold, strict=True)
+    )
     # Where nothing is corrupted no exchange is worth it, which saves a batch the waiting.
-    own = jnp.where(corrupted, own, jnp.inf)
+    own = jnp.where(corrupted, own[0], jnp.inf), jnp.where(corrupted, own[1], jnp.inf)
     left = limit - first.exchanges
     again = pivot(table, side, box.q, box.lower, box.upper, threshold=own, limit=left)
     new = _polish(box, _try(box, again), again)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kjax.qp.active_set import solve_active_set
+from kjax.qp.active_set import farkas, solve_active_set
 from kjax.qp.row_problem import RowProblem
 
 
@@ -61,14 +61,12 @@ def classify(problem: RowProblem, good: Array) -> Verdict:
             H=jnp.eye(n, dtype=dtype), q=q, C=rows, low=low, high=high,
             has_low=has_low, has_high=has_high, equal=equal,
         )  # fmt: skip
-        found = solve_active_set(
-            one, good, tolerance=float(jnp.finfo(dtype).eps), max_iterations=10 * (2 * n + m)
-        )
-        return found.x, found.infeasible, found.farkas
+        found, _ = solve_active_set(one, good, float(jnp.finfo(dtype).eps), 10 * (2 * n + m))
+        return found.x, found.infeasible, farkas(one, found)
 
     # No vmap: a loop of two is one compiled body as well, and neither waits for the other.
-    x, failed, farkas = jax.lax.map(lambda parts: solve(*parts), (q, low, high, equal))
-    y = jnp.concatenate([farkas[0, :m], farkas[0, m + n :]])
+    x, failed, proof = jax.lax.map(lambda parts: solve(*parts), (q, low, high, equal))
+    y = jnp.concatenate([proof[0, :m], proof[0, m + n :]])
     infeasible = good & failed[0] & proves_infeasible(problem, y)
     unbounded = good & ~failed[0] & is_feasible(problem, x[0]) & is_descent(problem, x[1])
     return Verdict(infeasible, unbounded, x[0])

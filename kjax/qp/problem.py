@@ -211,7 +211,8 @@ def kkt_residual(
     scale = 1.0 / jnp.sqrt(jnp.diagonal(H))
     scaled = H * scale[:, None] * scale[None, :]
     low, high, point = lower / scale, upper / scale, x / scale
-    slope = relative_gradient(scaled, q * scale, point)
+    terms = jnp.maximum(jnp.abs(scaled) @ jnp.abs(point), jnp.abs(q * scale))
+    slope = relative_gradient(scaled, q * scale, point, terms)
     size = jnp.max(jnp.abs(point))
     size = jnp.where(size > 0, size, 1.0)
     below, above = (point - low) / size, (point - high) / size
@@ -219,18 +220,14 @@ def kkt_residual(
 
 
 def relative_gradient(
-    H: Float[Array, "n n"], q: Float[Array, "n"], x: Float[Array, "n"]
+    H: Float[Array, "n n"], q: Float[Array, "n"], x: Float[Array, "n"], terms: Float[Array, "n"]
 ) -> Float[Array, "n"]:
-    """Gradient of the scaled problem relative to max(|H| |x|, |q|) of each variable.
-
-    Less what rounding leaves of it.
-    """
+    """Gradient of the scaled problem less what rounding leaves of it, relative to ``terms``."""
     gradient = H @ x + q
     n, eps = q.shape[0], float(jnp.finfo(q.dtype).eps)
     noise = 4.0 * n**0.5 * eps * jnp.maximum(jnp.max(jnp.abs(q)), jnp.max(jnp.abs(x)))
     excess = jnp.maximum(jnp.abs(gradient) - noise, 0.0)
-    own = jnp.maximum(jnp.abs(H) @ jnp.abs(x), jnp.abs(q))
-    return jnp.sign(gradient) * excess / jnp.where(own > 0, own, 1.0)
+    return jnp.sign(gradient) * excess / jnp.where(terms > 0, terms, 1.0)
 
 
 def box_error(
@@ -242,8 +239,9 @@ def box_error(
 ) -> Float[Array, ""]:
     """Residual of a point of the scaled problem that is inside the box, bounds to the last bit.
 
-    Unlike ``kkt_residual`` it takes a variable to be at a bound only where it is.
+    Unlike ``kkt_residual`` it takes a variable to be at a bound only where it is. Of |H| |x| the
+    diagonal's part alone, which saves a product with H.
     """
-    slope = relative_gradient(H, q, x)
+    slope = relative_gradient(H, q, x, jnp.maximum(jnp.abs(x), jnp.abs(q)))
     held = ((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0))
     return jnp.max(jnp.where(held, 0.0, jnp.abs(slope)))

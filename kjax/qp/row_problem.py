@@ -45,7 +45,8 @@ class RowProblem(NamedTuple):
     def errors(self, x: Array, y: Array) -> Array:
         """``kkt_errors`` of a point and its multipliers."""
         low, high = self.bounds()
-        return kkt_errors(self.H, self.q, self.C, low, high, jnp.ones_like(self.q), x, y)
+        one = jnp.ones_like(low)
+        return kkt_errors(self.H, self.q, self.C, low, high, one[: len(x)], one, x, y)[0]
 
 
 class RowScaling(NamedTuple):
@@ -58,7 +59,6 @@ class RowScaling(NamedTuple):
       at: (n,) values of the fixed variables, 0 elsewhere.
       fixed: (n,) variables whose bounds are equal.
       immovable: (m,) rows that no free variable can move.
-      contradicted: how far such a row breaks its bound at most, relative [-].
     """
 
     x: Float[Array, "n"]
@@ -67,7 +67,6 @@ class RowScaling(NamedTuple):
     at: Float[Array, "n"]
     fixed: Bool[Array, "n"]
     immovable: Bool[Array, "m"]
-    contradicted: Float[Array, ""]
 
 
 def variable_units(
@@ -96,23 +95,24 @@ def scale_rows(
     C: Float[Array, "m n"],
     low: Float[Array, "M"],
     high: Float[Array, "M"],
+    *,
+    equilibrate: bool = True,
 ) -> tuple[RowProblem, RowScaling]:
-    """Scaled problem of finite data with consistent bounds; H symmetric."""
+    """Scaled problem of finite data with consistent bounds; H symmetric.
+
+    ``equilibrate`` is for variables without curvature, whose unit then comes from the rows.
+    """
     m = C.shape[0]
     fixed = low[m:] == high[m:]
     free = ~fixed
     at = jnp.where(fixed, low[m:], 0.0)
-    d = variable_units(H, C, free)
+    d = variable_units(H, C[: len(C) * equilibrate], free)
     # Fixed variables leave: their columns act through q and the rows' bounds.
     linear = jnp.where(free, q + H @ at, 0.0) * d
     C_free = C * d * free
-    largest = jnp.max(jnp.abs(C_free), axis=1, initial=0.0)
-    immovable = largest == 0
-    divisor = jnp.where(immovable, 1.0, largest)
-    # Two steps, as squares of small entries are zero.
-    length = divisor * jnp.where(
-        immovable, 1.0, jnp.linalg.norm(C_free / divisor[:, None], axis=1)
-    )
+    length = jnp.linalg.norm(C_free, axis=1)
+    immovable = length == 0
+    length = jnp.where(immovable, 1.0, length)
     shift = jnp.concatenate([C @ at, at])
     off = jnp.concatenate([immovable, fixed])
     unit_of_row = jnp.concatenate([length, d])
@@ -138,11 +138,6 @@ def scale_rows(
         has_high=jnp.isfinite(high_hat) & ~equal & ~off,
         equal=equal,
     )
-    value = shift[:m]
-    over = jnp.maximum(low[:m] - value, value - high[:m])
-    bound = jnp.where(low[:m] > value, low[:m], high[:m])
-    terms = jnp.abs(jnp.where(over > 0, bound, 0.0)) + jnp.abs(C) @ jnp.abs(at)
-    contradiction = jnp.where(immovable & (over > 0), over / terms, 0.0)
     return problem, RowScaling(
         x=d * sigma,
         multipliers=cost / unit_of_row,
@@ -150,7 +145,6 @@ def scale_rows(
         at=at,
         fixed=fixed,
         immovable=immovable,
-        contradicted=jnp.max(contradiction, initial=0.0),
     )
 
 
@@ -175,53 +169,75 @@ def kkt_errors(
     low: Float[Array, "M"],
     high: Float[Array, "M"],
     d: Float[Array, "n"],
+    units: Float[Array, "M"],
     x: Float[Array, "n"],
     y: Float[Array, "M"],
-) -> Float[Array, "3"]:
-    """Primal, dual and gap of a point and its multipliers, relative, each by its own terms.
+) -> tuple[Float[Array, "3"], Float[Array, "M"], Float[Array, "M"]]:
+    """Primal, dual and gap of a point inside the box, relative, each by its own terms.
 
-    1. primal: of every row and bound, violation / (|bound| + |C| |x|).
+    1. primal: of every row, violation / (|bound| + |C| |x|).
     2. dual: of every variable, |H x + q + C^T y| / (|H| |x| + |q| + |C^T| |y|).
     3. gap: (sum of |multiplier| slack, and of dual residual |x|) / (|x^T H x| + |q|^T |x|).
 
     Component by component, so neither the size of the cost nor the unit of any variable or row
     matters. What rounding of the largest terms leaves is none of these; ``d`` are the units that
-    make variables comparable for that, 0 for those that are fixed. A multiplier at a side that does not exist counts as 0.
+    make variables comparable for that, 0 for those that are fixed, and ``units`` those of rows and
+    box for x = d. A multiplier at a side that does not exist counts as 0, and what holds a variable
+    at its bound is the rest of its equation: the multipliers that come back are those judged; the
+    values (m + n,) of rows and box follow.
     """
     m, n = C.shape
     rounding = 4.0 * n**0.5 * float(jnp.finfo(q.dtype).eps)
     y = jnp.where(jnp.where(y > 0, high < jnp.inf, low > -jnp.inf), y, 0.0)
-    size_C, size_x = jnp.abs(C), jnp.abs(x)
-    value = jnp.concatenate([C @ x, x])
-    terms = jnp.concatenate([size_C @ size_x, size_x])
+    y_rows, y_box, size_x = y[:m], y[m:], jnp.abs(x)
+    # Sums of products, not products of matrices: the sum and that of its terms in one pass.
+    by_H, by_C, by_y = H * x, C * x, C * y_rows[:, None]
+    Hx, value, push = by_H.sum(1), by_C.sum(1), by_y.sum(0)
     inverse = jnp.where(d > 0, 1.0 / jnp.where(d > 0, d, 1.0), 0.0)
-    noise = rounding * jnp.max(size_x * inverse) * jnp.concatenate([size_C @ d, d])
-    violated = jnp.maximum(low - value, value - high)
-    bound = jnp.where(low > value, low, high)
-    primal = _ratio(violated - noise, jnp.abs(jnp.where(violated > 0, bound, 0.0)) + terms)
+    reach = jnp.max(size_x * inverse)
 
-    Hx = H @ x
-    rounded_terms = jnp.abs(H) @ size_x + jnp.abs(q)
-    cost_terms = jnp.abs(Hx) + jnp.abs(q)
-    y_terms = size_C.T @ jnp.abs(y[:m]) + jnp.abs(y[m:])
-    r_dual = jnp.abs(Hx + q + C.T @ y[:m] + y[m:])
+    noise = rounding * reach * units
+    violated = jnp.maximum(low[:m] - value, value - high[:m])
+    bound = jnp.where(violated > 0, jnp.where(low[:m] > value, low[:m], high[:m]), 0.0)
+    primal = _ratio(violated - noise[:m], jnp.abs(bound) + jnp.abs(by_C).sum(1))
+
+    rest = -(Hx + q + push)
+    holds = jnp.where(rest > 0, x >= high[m:], x <= low[m:])
+    y_box = jnp.where(holds, rest, y_box)
+    y = jnp.concatenate([y_rows, y_box])
+    r_dual = jnp.abs(y_box - rest)
+    rounded_terms = jnp.abs(by_H).sum(1) + jnp.abs(q)
+    y_terms = jnp.abs(by_y).sum(0) + jnp.abs(y_box)
     hidden = rounding * jnp.maximum(rounded_terms, jnp.max(rounded_terms * d) * inverse)
-    floor = hidden + rounding * y_terms
-    dual = _ratio(r_dual - floor, rounded_terms + y_terms)
+    dual = _ratio(r_dual - hidden - rounding * y_terms, rounded_terms + y_terms)
 
     side = jnp.where(y > 0, high, low)
-    slack = jnp.where(y == 0, 0.0, jnp.abs(side - value))
+    slack = jnp.where(y == 0, 0.0, jnp.abs(side - jnp.concatenate([value, x])))
     whole = jnp.abs(q) @ size_x + jnp.abs(x @ Hx)
-    coarse = jnp.maximum(jnp.max(size_x * inverse) * (cost_terms @ d), whole)
+    coarse = jnp.maximum(reach * ((jnp.abs(Hx) + jnp.abs(q)) @ d), whole)
     y_size = jnp.abs(y)
-    gap = _ratio(
-        y_size @ jnp.maximum(slack - noise, 0.0) + jnp.maximum(r_dual - hidden, 0.0) @ size_x, whole
-    )
+    open_terms = y_size @ jnp.maximum(slack - noise, 0.0)
+    open_terms += jnp.maximum(r_dual - hidden, 0.0) @ size_x
     # Large multipliers that cancel one another must not hide what they leave in the cost; nor must
     # a point so far out that rounding hides a slope that goes on for ever.
-    gap += _ratio(y_size @ jnp.minimum(slack, noise), coarse)
-    gap += float(jnp.finfo(q.dtype).eps) ** 0.3 * _ratio(jnp.minimum(r_dual, hidden) @ size_x, coarse)
-    return jnp.stack([jnp.max(primal, initial=0.0), jnp.max(dual), gap])
+    small = float(jnp.finfo(q.dtype).eps) ** 0.3
+    hidden_terms = y_size @ jnp.minimum(slack, noise)
+    hidden_terms += small * (jnp.minimum(r_dual, hidden) @ size_x)
+    gap = _ratio(open_terms, whole) + _ratio(hidden_terms, coarse)
+    error = jnp.stack([jnp.max(primal, initial=0.0), jnp.max(dual), gap])
+    return error, y, jnp.concatenate([value, x])
+
+
+def contradicts(
+    scaling: RowScaling, C: Float[Array, "m n"], low: Array, high: Array, tolerance: float
+) -> Bool[Array, ""]:
+    """Whether a row that no free variable can move breaks its bound."""
+    m = C.shape[0]
+    low, high, value = low[:m], high[:m], C @ scaling.at
+    over = jnp.maximum(low - value, value - high)
+    bound = jnp.where(over > 0, jnp.where(low > value, low, high), 0.0)
+    terms = jnp.abs(bound) + jnp.abs(C) @ jnp.abs(scaling.at)
+    return (scaling.immovable & (_ratio(over, terms) > tolerance)).any()
 
 
 def rows_error(

@@ -24,14 +24,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from kjax.qp.active_set import solve_active_set
+from kjax.qp.active_set import ActiveSet, farkas, solve_active_set
 from kjax.qp.batching import where_needed
 from kjax.qp.certificates import Verdict, classify, proves_infeasible
 from kjax.qp.interior import descend_central_path
 from kjax.qp.polish import polish, solve_equations
 from kjax.qp.problem import Status, no_tangent
 from kjax.qp.row_derivative import active_equations
-from kjax.qp.row_problem import RowProblem, RowScaling, kkt_errors, scale_rows
+from kjax.qp.row_problem import RowProblem, RowScaling, contradicts, kkt_errors, scale_rows
 from kjax.qp.splitting import solve_splitting
 
 RowMethod = Literal["auto", "active_set", "interior_point", "admm"]
@@ -217,10 +217,9 @@ def _solve(
         jnp.where(sound, high, jnp.inf),
         sound,
     )
-    problem, scaling = scale_rows(*data[:5])  # step 1
-    contradicted = scaling.contradicted > tolerance
-    data = data._replace(good=sound & ~contradicted)
-
+    # step 1; the active set wants curvature everywhere, and needs no other units then
+    by_curvature = settings.method in ("auto", "active_set")
+    problem, scaling = scale_rows(*data[:5], equilibrate=not by_curvature)
     inner = settings._replace(tolerance=tolerance)
     if settings.method == "interior_point":  # step 2
         found = _by_interior_point(inner, problem, scaling, data)
@@ -234,8 +233,6 @@ def _solve(
             data.good & (~found.usable | (defeated & ~found.infeasible)),
             partial(_better_by_interior_point, inner),
             found,
-            problem,
-            scaling,
             data,
         )
     solved = found.solved(tolerance)
@@ -243,17 +240,14 @@ def _solve(
     if settings.method != "active_set":  # step 4; it proves infeasibility as it goes
         verdict = where_needed(
             data.good & found.usable & ~solved & ~found.infeasible,
-            _classified,
+            partial(_classified, tolerance),
             verdict,
-            problem,
-            scaling,
             data,
         )
     status = jnp.select(
         [
             ~finite,
             ~consistent,
-            contradicted,
             ~found.usable,
             solved,
             verdict.infeasible,
@@ -262,7 +256,6 @@ def _solve(
         [
             Status.NON_FINITE,
             Status.INFEASIBLE_BOUNDS,
-            Status.INFEASIBLE,
             Status.NOT_POSITIVE_DEFINITE,
             Status.SOLVED,
             Status.INFEASIBLE,
@@ -279,13 +272,12 @@ def _solve(
     x = jnp.where(usable, jnp.where(verdict.unbounded, verdict.x, found.x), scaling.at)
     x = jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), inside, outside)
     error = jnp.where(usable, found.error, jnp.inf)
-    primal = jnp.where(contradicted & sound, scaling.contradicted, error[0])
     y = jnp.where(usable & jnp.isfinite(found.y), found.y, 0.0)
     return RowSolution(
         x=x,
         multipliers=y,
         status=status.astype(jnp.int32),
-        primal=primal,
+        primal=error[0],
         dual=error[1],
         gap=error[2],
         margin=jnp.where(usable, found.margin, 0.0),
@@ -297,20 +289,24 @@ def _solve(
 def _by_active_set(
     settings: _Settings, problem: RowProblem, scaling: RowScaling, data: _Data
 ) -> _Found:
-    result = solve_active_set(
-        problem,
-        data.good,
-        tolerance=0.1 * settings.tolerance,
-        max_iterations=settings.max_iterations,
+    state, definite = solve_active_set(
+        problem, data.good, 0.1 * settings.tolerance, settings.max_iterations
     )
-    return _judge(
-        problem, scaling, data, result.x, result.multipliers,
-        result.bound_status > 0, result.bound_status < 0,
-        usable=result.definite | ~data.good,
-        infeasible=result.infeasible & proves_infeasible(problem, result.farkas),
-        iterations=result.iterations,
-        method=MethodUsed.ACTIVE_SET,
+    found = _judge(
+        problem, scaling, data, state.x, state.multipliers,
+        state.bound_status > 0, state.bound_status < 0, usable=definite | ~data.good,
+        infeasible=state.infeasible, iterations=state.iterations, method=MethodUsed.ACTIVE_SET,
     )  # fmt: skip
+
+    def proven(_: Array, state: ActiveSet, problem: Any, scaling: Any, data: Any) -> Array:
+        claimed = state.infeasible & proves_infeasible(problem, farkas(problem, state))
+        return claimed | contradicts(scaling, data.C, data.low, data.high, settings.tolerance)
+
+    needed = data.good & definite & ~found.solved(settings.tolerance)
+    infeasible = where_needed(
+        needed, proven, jnp.zeros((), bool), state, problem, scaling, data
+    )
+    return found._replace(infeasible=infeasible)
 
 
 def _by_interior_point(
@@ -320,7 +316,7 @@ def _by_interior_point(
     x, y, count = descend_central_path(
         problem,
         data.good & usable,
-        tolerance=0.1 * settings.tolerance,
+        tolerance=0.5 * settings.tolerance,
         max_iterations=settings.max_iterations,
     )
     return _judge_or_polish(
@@ -340,7 +336,7 @@ def _by_splitting(
         problem,
         data.good & usable,
         warm,
-        tolerance=0.1 * settings.tolerance,
+        tolerance=0.5 * settings.tolerance,
         max_iterations=settings.max_iterations,
     )
     return _judge_or_polish(
@@ -349,21 +345,22 @@ def _by_splitting(
     )  # fmt: skip
 
 
-def _better_by_interior_point(
-    settings: _Settings, old: _Found, problem: RowProblem, scaling: RowScaling, data: _Data
-) -> _Found:
+def _better_by_interior_point(settings: _Settings, old: _Found, data: _Data) -> _Found:
+    problem, scaling = scale_rows(*data[:5])
     new = _by_interior_point(settings, problem, scaling, data)
     new = new._replace(iterations=old.iterations + new.iterations)
     keep = old.usable & (jnp.max(old.error) <= jnp.max(new.error))
     return jax.tree.map(lambda a, b: jnp.where(keep, a, b), old, new)
 
 
-def _classified(old: Verdict, problem: RowProblem, scaling: RowScaling, data: _Data) -> Verdict:
+def _classified(tolerance: float, old: Verdict, data: _Data) -> Verdict:
     del old
+    problem, scaling = scale_rows(*data[:5])
     verdict = classify(problem, data.good)
     m = data.C.shape[0]
     x = jnp.clip(verdict.x * scaling.x + scaling.at, data.low[m:], data.high[m:])
-    return verdict._replace(x=x)
+    contradicted = contradicts(scaling, data.C, data.low, data.high, tolerance)
+    return Verdict(verdict.infeasible | contradicted, verdict.unbounded & ~contradicted, x)
 
 
 def _semidefinite(problem: RowProblem) -> Array:
@@ -427,20 +424,19 @@ def _judge(
     x = jnp.clip(x_hat * scaling.x + scaling.at, lower, upper)
     x = jnp.where(at_low[m:], lower, jnp.where(at_high[m:], upper, x))
     y = y_hat * scaling.multipliers
-    y = jnp.where(jnp.where(y > 0, data.high < jnp.inf, data.low > -jnp.inf), y, 0.0)
     y = jnp.where(jnp.concatenate([scaling.immovable, jnp.zeros_like(scaling.fixed)]), 0.0, y)
-    # What holds a variable at its bound is the rest of its equation.
-    rest = -(data.H @ x + data.q + data.C.T @ y[:m])
-    holds = jnp.where(rest > 0, x >= upper, x <= lower)
-    y = jnp.concatenate([y[:m], jnp.where(holds, rest, y[m:])])
     d = jnp.where(scaling.fixed, 0.0, scaling.x)
-    value = problem.rows(x_hat)
-    below = jnp.where(problem.has_low, jnp.maximum(value - problem.low, -y_hat), jnp.inf)
-    above = jnp.where(problem.has_high, jnp.maximum(problem.high - value, y_hat), jnp.inf)
+    error, y, value = kkt_errors(
+        data.H, data.q, data.C, data.low, data.high, d, scaling.values, x, y
+    )
+    force = y / scaling.multipliers
+    slack_low, slack_high = (value - data.low) / scaling.values, (data.high - value) / scaling.values
+    below = jnp.where(problem.has_low, jnp.maximum(slack_low, -force), jnp.inf)
+    above = jnp.where(problem.has_high, jnp.maximum(slack_high, force), jnp.inf)
     return _Found(
         x=x,
         y=y,
-        error=kkt_errors(data.H, data.q, data.C, data.low, data.high, d, x, y),
+        error=error,
         margin=jnp.min(jnp.minimum(below, above), initial=jnp.inf),
         usable=usable,
         infeasible=infeasible,

@@ -14,7 +14,7 @@ last index) ends after finitely many, since H is positive definite.
 Everything here is in the Jacobi-scaled coordinates of ``qp.problem``, in which x and g compare.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -50,7 +50,7 @@ def pivot(
     lower: Float[Array, "n"],
     upper: Float[Array, "n"],
     *,
-    threshold: Float[Array, "2 n"],
+    threshold: tuple[Array, Array],
     limit: int | Int[Array, ""],
 ) -> Pivoted:
     """Exchange variables until none is further off than ``threshold``, or ``limit`` is reached.
@@ -61,12 +61,14 @@ def pivot(
       q: linear term.
       lower: bounds; equal ones fix their variable.
       upper: bounds.
-      threshold: (2, n) of a bound's violation, and of a gradient's wrong sign.
+      threshold: of a bound's violation, and of a gradient's wrong sign; () or (n,) each.
       limit: of the exchanges.
     """
     zero = jnp.zeros((), jnp.int32)
     state = _State(table, side, q, pivot=zero, pending=jnp.ones((), bool), exchanges=zero)
-    problem = (q, lower, upper, threshold, jnp.asarray(limit, jnp.int32))
+    tiny = float(jnp.finfo(q.dtype).tiny)
+    weight = tuple(1.0 / jnp.maximum(part, tiny) for part in threshold)
+    problem = (q, lower, upper, weight, jnp.asarray(limit, jnp.int32))
     state = while_any(lambda state: state.pending, _exchange, _choose(state, *problem), *problem)
     return Pivoted(table=state.table, side=state.side, y=state.y, exchanges=state.exchanges)
 
@@ -83,7 +85,7 @@ class _State(NamedTuple):
 
 
 def _choose(
-    state: _State, q: Array, lower: Array, upper: Array, threshold: Array, limit: Array
+    state: _State, q: Array, lower: Array, upper: Array, weight: Any, limit: Array
 ) -> _State:
     """Which variable violates its conditions most."""
     n, dtype = q.shape[0], q.dtype
@@ -93,18 +95,18 @@ def _choose(
     violation = jnp.where(
         free, jnp.maximum(lower - y, y - upper), jnp.sign(side).astype(dtype) * (y + q)
     )
-    violation = jnp.where(violation > jnp.where(free, *threshold), violation, -jnp.inf)
+    violation = violation * jnp.where(free, *weight)
     violation = jnp.where(fixed, jnp.where(free, jnp.inf, -jnp.inf), violation)
     # Murty's rule as a priority: above every violation, and higher for higher indices.
     by_index = jnp.finfo(dtype).max * (jnp.arange(n) + 1).astype(dtype) / (2 * n)
-    violation = jnp.where((state.exchanges > 3 * n) & (violation > 0), by_index, violation)
+    violation = jnp.where((state.exchanges > 3 * n) & (violation > 1.0), by_index, violation)
     pivot = jnp.argmax(violation).astype(jnp.int32)
-    pending = state.pending & (violation[pivot] > 0) & (state.exchanges < limit)
+    pending = state.pending & (violation[pivot] > 1.0) & (state.exchanges < limit)
     return state._replace(y=y, pivot=pivot, pending=pending)
 
 
 def _exchange(
-    state: _State, q: Array, lower: Array, upper: Array, threshold: Array, limit: Array
+    state: _State, q: Array, lower: Array, upper: Array, weight: Any, limit: Array
 ) -> _State:
     """The state after the exchange of the pivot; the same one if none is pending."""
     table, side, y, pivot, pending, count = state
@@ -120,4 +122,4 @@ def _exchange(
     new_status = jnp.where((y < lower) | (lower >= upper), -1, 1).astype(side.dtype)
     side = jnp.where(is_pivot, jnp.where(side == 0, new_status, 0), side)
     moved = state._replace(table=table, side=side, exchanges=count + pending)
-    return _choose(moved, q, lower, upper, threshold, limit)
+    return _choose(moved, q, lower, upper, weight, limit)
