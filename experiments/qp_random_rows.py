@@ -5,7 +5,6 @@ solver; the judge is plain NumPy. Linear programs that are not drawn so go to Hi
 """
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -209,8 +208,10 @@ def linear_program_cost(data: tuple[np.ndarray, ...]) -> float | None:
     _, q, C, low, high, lower, upper = data
     rows, sides = [], []
     for a, lo, up in zip(C, low, high, strict=True):
-        rows += [a] * np.isfinite(up) + [-a] * np.isfinite(lo)
-        sides += [up] * np.isfinite(up) + [-lo] * np.isfinite(lo)
+        for row, side in ((a, up), (-a, -lo)):
+            if np.isfinite(side):
+                rows.append(row)
+                sides.append(side)
     found = linprog(
         q, A_ub=np.array(rows) if rows else None, b_ub=np.array(sides) if rows else None,
         bounds=list(zip(lower, upper, strict=True)), method="highs",
@@ -222,15 +223,21 @@ def _solvers(kind: str) -> Iterator[tuple[str, Any]]:
     """Methods by name, each a compiled function of a batch: x and status."""
     if kind == "box":
         for method in qp.METHODS:
-            def box(H: Any, q: Any, C: Any, a: Any, b: Any, lower: Any, upper: Any, method: Any = method) -> Any:  # noqa: E501
+
+            def box(
+                H: Any, q: Any, C: Any, a: Any, b: Any, lower: Any, upper: Any, method: Any = method
+            ) -> Any:
                 del C, a, b
                 found = qp.solve(qp.prepare(H), q, lower, upper, method=method, tolerance=TOLERANCE)
                 return found.x, found.status
+
             yield f"box {method}", jax.jit(jax.vmap(box))
     for method in qp.ROW_METHODS:
+
         def rows(*data: Any, method: Any = method) -> Any:
             found = qp.solve_rows(*data, method=method, tolerance=TOLERANCE)
             return found.x, found.status
+
         yield method, jax.jit(jax.vmap(rows))
 
 
@@ -252,6 +259,11 @@ def count(
                 entry = result.setdefault(f"{name}, {kind}", dict.fromkeys(COUNTS, 0))
                 _tally(entry, problems, x, status)
     return result
+
+
+def wrong(counts: dict[str, dict[str, int]]) -> int:
+    """All wrong answers of ``count``."""
+    return sum(n for entry in counts.values() for k, n in entry.items() if k.startswith("wrong"))
 
 
 def _tally(entry: dict[str, int], problems: Problems, x: np.ndarray, status: np.ndarray) -> None:

@@ -71,7 +71,7 @@ class LmpcConfig:
     caution: NonNegative = 0.0
     """How much less a step of the horizon weighs where the model is less certain; 0: none [-]."""
     solver: Literal["tableau", "admm", "projected_gradient"] = "tableau"
-    """Method of the QP; the first is exact, the last one solves a box without rows only [-]."""
+    """Method of the QP: the first is exact, the last keeps no rows (friction, torque) [-]."""
     warm_start: bool = True
     """Carry the tableau from tick to tick; without, a batch of robots keeps a smaller state [-]."""
     tolerance: Positive = 1e-9
@@ -88,7 +88,7 @@ class LmpcConfig:
         require_order(self)
         if self.solver == "projected_gradient" and min(self.friction, self.torque_fraction) < inf:
             raise ValueError(
-                "solver = 'projected_gradient' cannot keep the rows of friction and torque_fraction:"
+                "solver = 'projected_gradient' cannot keep rows of friction and torque_fraction:"
                 " set solver = 'tableau' or 'admm', or friction = torque_fraction = inf"
             )
         return self

@@ -30,7 +30,6 @@ from jaxtyping import Array, Bool, Float, Int
 from kjax.qp.batching import while_any
 from kjax.qp.row_problem import RowProblem
 
-
 ROUNDS = 3  # of steps 2 to 5; one is usual
 
 
@@ -71,6 +70,7 @@ class _Settings(NamedTuple):
     tolerance: float
     max_iterations: int
     rounding: float
+    rounds: int
 
 
 def solve_active_set(
@@ -114,6 +114,8 @@ def solve_active_set(
         tolerance=max(tolerance, 10.0 * eps),
         max_iterations=max_iterations,
         rounding=max(10.0 * eps, min(30.0 * n * eps, 1e-11)),
+        # In float32 what a second round finds is rounding again.
+        rounds=ROUNDS if eps < 1e-12 else 1,
     )
     state = while_any(
         lambda state: state.pending,
@@ -137,7 +139,9 @@ def farkas(problem: RowProblem, state: ActiveSet) -> Float[Array, "M"]:
     return state.bound_status * given - jnp.where(is_chosen, state.sign, 0.0)
 
 
-def _round(settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array) -> ActiveSet:
+def _round(
+    settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array
+) -> ActiveSet:
     """Steps 2 to 4 until no row is violated, then step 5: pending again if one is violated now."""
     found = while_any(
         lambda state: state.pending,
@@ -147,7 +151,7 @@ def _round(settings: _Settings, state: ActiveSet, problem: RowProblem, rounding:
         rounding,
     )
     found = _polish(problem, _polish(problem, found))
-    found = found._replace(rounds=state.rounds + 1, pending=state.rounds < ROUNDS - 1)
+    found = found._replace(rounds=state.rounds + 1, pending=state.rounds < settings.rounds - 1)
     found = _choose(settings, found, problem)
     return jax.tree.map(lambda new, old: jnp.where(state.pending, new, old), found, state)
 
@@ -163,7 +167,12 @@ def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem) -> Activ
     # Relative to the row's own terms; below the second number it is rounding.
     eps = float(jnp.finfo(value.dtype).eps)
     bound = jnp.where(below >= above, jnp.abs(problem.low), jnp.abs(problem.high))
-    own = settings.tolerance * (bound + jnp.abs(value)) + 100.0 * eps * jnp.max(jnp.abs(state.x))
+    size = jnp.maximum(jnp.max(jnp.abs(state.x)), 1.0)  # of x, which is 1 where it is not far out
+    # Before the first polish, rounding is that of the unconstrained minimiser.
+    curvature = jnp.max(jnp.diagonal(problem.H))
+    outside = jnp.max(jnp.abs(problem.q)) / jnp.where(curvature > 0, curvature, 1.0)
+    noise = jnp.where(state.rounds == 0, 10.0 * jnp.maximum(size, outside), 100.0 * size)
+    own = settings.tolerance * (bound + jnp.abs(value)) + eps * noise
     violation = jnp.where(violation > own, violation, -jnp.inf)
     # Equations come first, and count even where they hold by chance.
     violation = jnp.where(problem.equal & inactive, jnp.inf, violation)
@@ -183,7 +192,9 @@ def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem) -> Activ
     )
 
 
-def _advance(settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array) -> ActiveSet:
+def _advance(
+    settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array
+) -> ActiveSet:
     """Steps 3 and 4: add the chosen row, or drop the one that is in its way; then step 2."""
     n, dtype = problem.q.shape[0], problem.q.dtype
     eps = float(jnp.finfo(dtype).eps)

@@ -70,7 +70,9 @@ def where_needed(
         def piece(order: Array, i: Array, out: Any) -> Any:
             index = jax.lax.dynamic_slice_in_dim(order, i * CHUNK, CHUNK)
             old, chosen = jax.tree.map(lambda leaf: leaf[index], (value, needed))
-            mine = jax.tree.map(lambda leaf, there: leaf[index] if there else leaf, args, in_batched[2])
+            mine = jax.tree.map(
+                lambda leaf, there: leaf[index] if there else leaf, args, in_batched[2]
+            )
             new = jax.vmap(lambda v, a: function(v, *a), in_axes=(0, axes))(old, mine)
             return jax.tree.map(
                 lambda out, new, old: out.at[index].set(

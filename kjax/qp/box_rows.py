@@ -97,7 +97,7 @@ def solve_rows_from_box(
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _differentiable(settings: _Settings, *data: Any) -> BoxRowSolution:
-    prepared, index, q, C, row_lower, row_upper, lower, upper, warm = data
+    prepared, index, q, _, _, _, lower, upper, warm = data
     box = _solve_box(settings, prepared, index, q, lower, upper, warm)
     return _with_rows(settings, box, *data)[0]
 
@@ -152,11 +152,13 @@ def _with_rows(
     return solution, y
 
 
-def _solve_whole(settings: _Settings, value: Any, hessian: Any, index: Any, *data: Any) -> Any:
+def _solve_whole(
+    settings: _Settings, value: Any, hessian: Any, index: Any, q: Array, C: Array, *bounds: Array
+) -> Any:
     """Step 3."""
     H, d = hessian if index is None else jax.tree.map(lambda a: a[index], hessian)
     found = solve_rows(
-        H / (d[:, None] * d), *data, value[0],
+        H / (d[:, None] * d), q, C, bounds[0], bounds[1], bounds[2], bounds[3], value[0],
         method=settings.row_method,
         tolerance=settings.tolerance,
         max_iterations=settings.max_iterations,
@@ -170,7 +172,7 @@ def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, 
     prepared, index, q, C, row_lower, row_upper, lower, upper, warm = primals
     d_prepared, _, dq, dC, d_row_lower, d_row_upper, d_lower, d_upper, _ = tangents
     box, d_box = jax.jvp(
-        lambda p, *rest: _solve_box(settings, p, index, *rest, warm),
+        lambda p, q, lower, upper: _solve_box(settings, p, index, q, lower, upper, warm),
         (prepared, q, lower, upper),
         (d_prepared, dq, d_lower, d_upper),
     )
@@ -196,7 +198,7 @@ def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, 
 
 
 def _inverse(empty: Any, H: Array, A: Array) -> tuple[Array, Array]:
-    """dx of ``solve_equations`` by every entry of r_dual and of r_primal."""
+    """Dx of ``solve_equations`` by every entry of r_dual and of r_primal."""
     by_dual, by_primal = (jnp.eye(part.shape[1], dtype=H.dtype) for part in empty)
     columns = jax.vmap(lambda r, s: solve_equations(H, A, r, s)[0], out_axes=1)
     return (

@@ -6,7 +6,8 @@ regard to how H and q are conditioned:
 1. The feasible point of least norm. If there is none, multipliers y with A^T y = 0 and a negative
    support sum(y_+ high - y_- low) prove it (Farkas).
 2. The projection d of -q onto the directions of descent that nothing stops: H d = 0, and A d within
-   the recession cone of the rows. q^T d = -|d|^2, so d is zero exactly where the problem is bounded.
+   the recession cone of the rows. q^T d = -|d|^2, so d is zero exactly where the problem has a
+   lower end.
 
 What is found is checked before it counts.
 """
@@ -49,10 +50,12 @@ def classify(problem: RowProblem, good: Array) -> Verdict:
         return jnp.concatenate([whole[:m], extra, whole[m:]])
 
     none = jnp.zeros_like(problem.low)
+    low, high = between(problem.low, zero), between(problem.high, zero)
+    at_zero = between(none, zero)
     kinds = (
-        (zero, between(problem.low, zero), between(problem.high, zero), between(problem.equal, never)),
-        (problem.q, between(none, zero), between(none, zero), between(problem.equal, curved)),
-    )  # fmt: skip
+        (zero, low, high, between(problem.equal, never)),
+        (problem.q, at_zero, at_zero, between(problem.equal, curved)),
+    )
     q, low, high, equal = (jnp.stack(parts) for parts in zip(*kinds, strict=True))
     has_low, has_high = (between(has, never) for has in (problem.has_low, problem.has_high))
 

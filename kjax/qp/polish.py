@@ -1,7 +1,7 @@
-"""The equations that the active rows make: a method's point brought to rounding, and derivatives.
+r"""The equations that the active rows make: a method's point brought to rounding, and derivatives.
 
-    [ H  A^T ] [ dx ]     [ -r_dual   ]
-    [ A  0   ] [ dy ]  =  [  r_primal ]      with A the active rows
+[ H  A^T ] [ dx ]     [ -r_dual   ]
+[ A  0   ] [ dy ]  =  [  r_primal ]      with A the active rows
 """
 
 import jax.numpy as jnp

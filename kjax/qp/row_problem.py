@@ -46,6 +46,7 @@ class RowProblem(NamedTuple):
         """``kkt_errors`` of a point and its multipliers."""
         low, high = self.bounds()
         one = jnp.ones_like(low)
+        x = snapped(x)
         return kkt_errors(self.H, self.q, self.C, low, high, one[: len(x)], one, x, y)[0]
 
 
@@ -67,6 +68,15 @@ class RowScaling(NamedTuple):
     at: Float[Array, "n"]
     fixed: Bool[Array, "n"]
     immovable: Bool[Array, "m"]
+
+
+def snapped(x: Float[Array, "n"]) -> Float[Array, "n"]:
+    """The scaled point, what is rounding beside its expected size 1 set to 0.
+
+    At the tip of a friction cone all terms of a row vanish: there nothing but 0 keeps it.
+    """
+    rounding = 16.0 * x.shape[0] ** 0.5 * float(jnp.finfo(x.dtype).eps)
+    return jnp.where(jnp.abs(x) <= rounding, 0.0, x)
 
 
 def variable_units(

@@ -31,7 +31,14 @@ from kjax.qp.interior import descend_central_path
 from kjax.qp.polish import polish, solve_equations
 from kjax.qp.problem import Status, no_tangent
 from kjax.qp.row_derivative import active_equations
-from kjax.qp.row_problem import RowProblem, RowScaling, contradicts, kkt_errors, scale_rows
+from kjax.qp.row_problem import (
+    RowProblem,
+    RowScaling,
+    contradicts,
+    kkt_errors,
+    scale_rows,
+    snapped,
+)
 from kjax.qp.splitting import solve_splitting
 
 RowMethod = Literal["auto", "active_set", "interior_point", "admm"]
@@ -303,9 +310,7 @@ def _by_active_set(
         return claimed | contradicts(scaling, data.C, data.low, data.high, settings.tolerance)
 
     needed = data.good & definite & ~found.solved(settings.tolerance)
-    infeasible = where_needed(
-        needed, proven, jnp.zeros((), bool), state, problem, scaling, data
-    )
+    infeasible = where_needed(needed, proven, jnp.zeros((), bool), state, problem, scaling, data)
     return found._replace(infeasible=infeasible)
 
 
@@ -421,7 +426,7 @@ def _judge(
     """Step 3. A bound that is active (``at_low``, ``at_high``) is kept to the last bit."""
     m = data.C.shape[0]
     lower, upper = data.low[m:], data.high[m:]
-    x = jnp.clip(x_hat * scaling.x + scaling.at, lower, upper)
+    x = jnp.clip(snapped(x_hat) * scaling.x + scaling.at, lower, upper)
     x = jnp.where(at_low[m:], lower, jnp.where(at_high[m:], upper, x))
     y = y_hat * scaling.multipliers
     y = jnp.where(jnp.concatenate([scaling.immovable, jnp.zeros_like(scaling.fixed)]), 0.0, y)
@@ -430,7 +435,10 @@ def _judge(
         data.H, data.q, data.C, data.low, data.high, d, scaling.values, x, y
     )
     force = y / scaling.multipliers
-    slack_low, slack_high = (value - data.low) / scaling.values, (data.high - value) / scaling.values
+    slack_low, slack_high = (
+        (value - data.low) / scaling.values,
+        (data.high - value) / scaling.values,
+    )
     below = jnp.where(problem.has_low, jnp.maximum(slack_low, -force), jnp.inf)
     above = jnp.where(problem.has_high, jnp.maximum(slack_high, force), jnp.inf)
     return _Found(

@@ -53,7 +53,7 @@ class _State(NamedTuple):
     error: Float[Array, ""]
     infeasible: Bool[Array, ""]
     stop: Bool[Array, ""]
-    count: Int[Array, ""]
+    spent: Int[Array, ""]
 
 
 def solve_splitting(
@@ -76,7 +76,7 @@ def solve_splitting(
         return x, jnp.max(problem.errors(x, y))
 
     def unfinished(state: _State) -> Array:
-        return ~state.stop & (state.count < max_iterations)
+        return ~state.stop & (state.spent < max_iterations)
 
     def advance(state: _State) -> _State:
         rho = state.rho * weight
@@ -91,7 +91,7 @@ def solve_splitting(
             new_v = jnp.clip(mixed + y / rho, low, high)
             return ALPHA * new_x + (1.0 - ALPHA) * x, new_v, y + rho * (mixed - new_v), x, y
 
-        steps = jnp.minimum(CHECK, max_iterations - state.count)
+        steps = jnp.minimum(CHECK, max_iterations - state.spent)
         carry = (state.x, state.v, state.y, state.x, state.y)
         x, v, y, old_x, old_y = jax.lax.fori_loop(0, steps, step, carry)
 
@@ -120,7 +120,7 @@ def solve_splitting(
             x=x, v=v, y=y, rho=jnp.clip(state.rho * factor, 1e-6, 1e6),
             best_x=jnp.where(better, new_x, state.best_x),
             best_y=jnp.where(better, new_y, state.best_y),
-            error=error, infeasible=infeasible, stop=stop, count=state.count + steps,
+            error=error, infeasible=infeasible, stop=stop, spent=state.spent + steps,
         )  # fmt: skip
 
     never = jnp.zeros((), bool)
@@ -134,10 +134,10 @@ def solve_splitting(
         error=jnp.asarray(jnp.inf, dtype),
         infeasible=never,
         stop=~good,
-        count=jnp.zeros((), jnp.int32),
+        spent=jnp.zeros((), jnp.int32),
     )
     state = jax.lax.while_loop(unfinished, advance, start)
-    return Split(state.best_x, state.best_y, state.infeasible, state.count)
+    return Split(state.best_x, state.best_y, state.infeasible, state.spent)
 
 
 def _largest(*parts: Array) -> Array:

@@ -67,8 +67,8 @@ def pivot(
     zero = jnp.zeros((), jnp.int32)
     state = _State(table, side, q, pivot=zero, pending=jnp.ones((), bool), exchanges=zero)
     tiny = float(jnp.finfo(q.dtype).tiny)
-    weight = tuple(1.0 / jnp.maximum(part, tiny) for part in threshold)
-    problem = (q, lower, upper, weight, jnp.asarray(limit, jnp.int32))
+    weights = tuple(1.0 / jnp.maximum(part, tiny) for part in threshold)
+    problem: tuple[Any, ...] = (q, lower, upper, weights, jnp.asarray(limit, jnp.int32))
     state = while_any(lambda state: state.pending, _exchange, _choose(state, *problem), *problem)
     return Pivoted(table=state.table, side=state.side, y=state.y, exchanges=state.exchanges)
 
@@ -95,7 +95,7 @@ def _choose(
     violation = jnp.where(
         free, jnp.maximum(lower - y, y - upper), jnp.sign(side).astype(dtype) * (y + q)
     )
-    violation = violation * jnp.where(free, *weight)
+    violation = violation * jnp.where(free, weight[0], weight[1])
     violation = jnp.where(fixed, jnp.where(free, jnp.inf, -jnp.inf), violation)
     # Murty's rule as a priority: above every violation, and higher for higher indices.
     by_index = jnp.finfo(dtype).max * (jnp.arange(n) + 1).astype(dtype) / (2 * n)
@@ -114,7 +114,9 @@ def _exchange(
     is_pivot = (jnp.arange(n, dtype=jnp.int32) == pivot) & pending
     unit = is_pivot.astype(dtype)
     sign = jnp.where(side == 0, 1.0, -1.0).astype(dtype)
-    row = unit @ table  # a product, not table[pivot]: XLA would index inside the update's inner loop
+    row = (
+        unit @ table
+    )  # a product, not table[pivot]: XLA would index inside the update's inner loop
     # The tableau is symmetric but for the signs between free and bound variables.
     column = row * (sign * sign[pivot])
     divisor = jnp.where(pending, 1.0 / jnp.where(pending, row[pivot], 1.0), 0.0)

@@ -229,3 +229,18 @@ def test_a_useless_tolerance_of_rows_is_none_in_float32(method):
     solution = solve32(np.eye(n, dtype=np.float32), q, C, low, high, *box)
     assert solution.status == Status.SOLVED
     assert_feasible(C, low, high, lower, upper, np.asarray(solution.x), tolerance=1e-5)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_at_the_tip_of_all_friction_cones_the_answer_is_no_force(dtype, method):
+    """Every term of every row vanishes there: what rounding leaves of 0 must not be judged."""
+    n = 6
+    C = np.kron(np.eye(n // 2), [[1.0, -0.6], [-1.0, -0.6]]).astype(dtype)
+    q = np.tile([3.0, 40.0], n // 2).astype(dtype)
+    factor = np.random.default_rng(0).normal(size=(n, n))
+    H = (factor @ factor.T + np.eye(n)).astype(dtype)
+    rows = np.full(n, -INF, dtype), np.zeros(n, dtype)
+    box = np.tile([-60.0, 0.0], n // 2).astype(dtype), np.tile([60.0, 160.0], n // 2).astype(dtype)
+    solution = solve(H, q, C, *rows, *box, method=method)
+    assert solution.status == Status.SOLVED
+    np.testing.assert_allclose(solution.x, 0.0, atol=1e-4 if dtype == "float32" else 1e-10)
