@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import qp_checks
+import qp_random_rows
 from qp_peers import box_peers, daqp_cold
 from qp_problems import record_box, record_rows
 
@@ -73,6 +74,8 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     result["rows"] = rows_single(record_rows(seconds), peers)
     print("random problems")
     result["random"] = qp_checks.random_solves(RANDOM // 100 if quick else RANDOM)
+    result["random_rows"] = qp_random_rows.count(RANDOM // 100 if quick else RANDOM)
+    result["random_rows_wrong"] = qp_random_rows.wrong(result["random_rows"])
     if args.problems is not None:
         print(f"problems in {args.problems}")
         result["public"] = qp_checks.public_problems(args.problems, peers)

@@ -1,5 +1,6 @@
 """The controller: command, LMPC, gaits, legs."""
 
+from math import inf
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -69,7 +70,7 @@ class LmpcConfig:
     caution: NonNegative = 0.0
     """How much less a step of the horizon weighs where the model is less certain; 0: none [-]."""
     solver: Literal["tableau", "admm", "projected_gradient"] = "tableau"
-    """Method of the box QP; the first is exact [-]."""
+    """Method of the QP: the first is exact, the last keeps no rows (friction, torque) [-]."""
     warm_start: bool = True
     """Carry the tableau from tick to tick; without, a batch of robots keeps a smaller state [-]."""
     tolerance: Positive = 1e-9
@@ -84,6 +85,11 @@ class LmpcConfig:
     @model_validator(mode="after")
     def _check(self) -> "LmpcConfig":
         require_order(self)
+        if self.solver == "projected_gradient" and min(self.friction, self.torque_fraction) < inf:
+            raise ValueError(
+                "solver = 'projected_gradient' cannot keep rows of friction and torque_fraction:"
+                " set solver = 'tableau' or 'admm', or friction = torque_fraction = inf"
+            )
         return self
 
 

@@ -1,10 +1,11 @@
 """The LMPC as tables: everything that a contact mode fixes is built once, off line.
 
-On line a plan is: lift, one matrix-vector product for the linear term, one box QP.
+On line a plan is: lift, one matrix-vector product for the linear term, one box QP. Rows on the
+forces are checked at its solution; only where one is violated a QP with rows follows.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -244,25 +245,6 @@ def solve_lmpc(
         F, G = problem.F, problem.G
     q = F @ z - G @ reference.reshape(-1) + tables.q_input[mode]
 
-    if rows is not None:
-        now = hessian if index is None else jax.tree.map(lambda a: a[index], hessian)
-        H = now.H / (now.scale[:, None] * now.scale)
-        C = jnp.kron(jnp.eye(config.horizon, dtype=q.dtype), rows.A)
-        solved = qp.solve_rows(
-            H,
-            q,
-            C,
-            jnp.tile(rows.low, config.horizon),
-            jnp.tile(rows.high, config.horizon),
-            lower,
-            upper,
-            method="active_set",
-            tolerance=config.tolerance,
-            max_iterations=config.max_iterations,
-        )
-        worst = jnp.maximum(jnp.maximum(solved.primal, solved.dual), solved.gap)
-        return LmpcSolution(solved.x, solved.status, worst, solved.iterations, memory.warm)
-
     warm: qp.Warm | Array | None = memory.warm
     if memory.warm is not None:
         # Another mode is another Hessian: its own cold start then.
@@ -275,17 +257,28 @@ def solve_lmpc(
         warm = qp.Warm(x=memory.warm.x, table=table, side=side)
     elif config.solver != "tableau":
         warm = shift_plan(memory.plan, config)
-    solution = qp.solve(
-        hessian,
-        q,
-        lower,
-        upper,
-        warm,
-        index=index,
-        method=config.solver,
-        tolerance=config.tolerance,
-        max_iterations=config.max_iterations,
-    )
+    options: dict[str, Any] = {
+        "index": index,
+        "tolerance": config.tolerance,
+        "max_iterations": config.max_iterations,
+    }
+    solution: qp.Solution | qp.BoxRowSolution
+    if rows is None:
+        solution = qp.solve(hessian, q, lower, upper, warm, method=config.solver, **options)
+    else:
+        solution = qp.solve_rows_from_box(
+            hessian,
+            q,
+            jnp.kron(jnp.eye(config.horizon, dtype=q.dtype), rows.A),
+            jnp.tile(rows.low, config.horizon),
+            jnp.tile(rows.high, config.horizon),
+            lower,
+            upper,
+            warm,
+            box_method=config.solver,
+            row_method="admm" if config.solver == "admm" else "active_set",
+            **options,
+        )
     kept = None if memory.warm is None else solution.warm
     return LmpcSolution(solution.x, solution.status, solution.residual, solution.iterations, kept)
 

@@ -1,6 +1,7 @@
 """Convex quadratic programs with a box, or with general rows; this package knows no robot."""
 
 from kjax.qp.box import METHODS, Method, solve
+from kjax.qp.box_rows import BoxRowSolution, solve_rows_from_box
 from kjax.qp.problem import (
     STATUS_TEXT,
     Prepared,
@@ -11,13 +12,15 @@ from kjax.qp.problem import (
     prepare,
     start,
 )
-from kjax.qp.rows import ROW_METHODS, RowMethod, RowSolution, solve_rows
+from kjax.qp.rows import ROW_METHODS, MethodUsed, RowMethod, RowSolution, solve_rows
 
 __all__ = [
     "METHODS",
     "ROW_METHODS",
     "STATUS_TEXT",
+    "BoxRowSolution",
     "Method",
+    "MethodUsed",
     "Prepared",
     "RowMethod",
     "RowSolution",
@@ -28,5 +31,6 @@ __all__ = [
     "prepare",
     "solve",
     "solve_rows",
+    "solve_rows_from_box",
     "start",
 ]

@@ -1,209 +1,276 @@
 """Dual active-set method (Goldfarb and Idnani 1983) on the scaled problem of ``qp.row_problem``.
 
-Start from the unconstrained minimiser and take in violated rows one by one. With N the normals of
-the active rows, each pointing inwards, two matrices are kept,
+With N the normals of the active rows, each pointing inwards, two matrices are kept,
 
-    P = H^-1 - H^-1 N U,    U = (N^T H^-1 N)^-1 N^T H^-1:
+    P = H^-1 - H^-1 N U,    U = (N^T H^-1 N)^-1 N^T H^-1.
 
-a row with normal a moves x along P a and the multipliers of the active rows by -U a, until it
-holds, or until a multiplier is used up and its row leaves first. Either event changes the stack
-(P, U) by one outer product, so nothing is factorised after H. The multipliers stay right at every
-step and the objective rises, so the method ends; a row that nothing can give way to proves the
-problem infeasible. Few active rows, the case of a walking robot, mean few iterations.
+1. Start from the unconstrained minimiser, no row active.
+2. Choose the most violated row, normal a; without one, go to step 5.
+3. Ratio test: x moves along P a and the multipliers of the active rows by -U a, until the row
+   holds (it is added), or until a multiplier is used up (its row is dropped first). A row that
+   nothing can give way to proves the problem infeasible.
+4. Either event changes the stack (P, U) by one outer product, so nothing is factorised after H.
+   Go to step 2.
+5. Polish: two Newton steps of the equations that the active rows make. Where the unconstrained
+   minimiser lay far outside, rounding has hidden violations that show now: then once more from
+   step 2.
+
+The multipliers stay right at every step and the objective rises, so the method ends. Few active
+rows, the case of a legged robot, mean few iterations.
 """
 
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from kjax.qp.batching import while_any
 from kjax.qp.row_problem import RowProblem
 
+ROUNDS = 3  # of steps 2 to 5; one is usual
 
-class _State(NamedTuple):
+
+class ActiveSet(NamedTuple):
     """Iterate of the method; M = m + n rows, those of the box last.
 
     Attributes:
       stack: (n + M, n) P, and U with a row per row of the problem, zero where not active.
       x: (n,) point.
       y: (M,) multipliers along the inward normals, not negative but for equations.
-      side: (M,) 1 active at the lower side, -1 at the upper one, 0 not active.
-      at: row to take in.
+      bound_status: (M,) 1 active at the lower side, -1 at the upper one, 0 not active.
+      chosen: row to add.
       sign: of its inward normal.
-      more: whether there is one.
-      infeasible: whether a row cannot be made to hold.
-      iterations: spent.
+      pending: whether there is one.
+      infeasible: whether the chosen row cannot be made to hold.
+      rounds: of steps 2 to 5.
+      iterations: rows added and dropped.
     """
 
     stack: Float[Array, "n+M n"]
     x: Float[Array, "n"]
     y: Float[Array, "M"]
-    side: Float[Array, "M"]
-    at: Array
+    bound_status: Float[Array, "M"]
+    chosen: Array
     sign: Array
-    more: Array
+    pending: Array
     infeasible: Array
+    rounds: Int[Array, ""]
     iterations: Int[Array, ""]
 
-
-class ActiveSet(NamedTuple):
-    """Outcome of ``take_in_rows``.
-
-    Attributes:
-      x: (n,) point.
-      multipliers: (M,) positive at upper sides.
-      definite: whether H is positive definite to working precision; else all this is nothing.
-      infeasible: whether no point keeps all rows.
-      iterations: rows taken in and put out.
-    """
-
-    x: Float[Array, "n"]
-    multipliers: Float[Array, "M"]
-    definite: Array
-    infeasible: Array
-    iterations: Int[Array, ""]
+    @property
+    def multipliers(self) -> Float[Array, "M"]:
+        """Multipliers (M,) of the rows, positive at upper sides."""
+        return -self.bound_status * self.y
 
 
-def take_in_rows(
-    problem: RowProblem, good: Array, *, tolerance: float, max_iterations: int
-) -> ActiveSet:
-    """Solve the problem; H must be positive definite. Nothing is done if not ``good``.
+class _Settings(NamedTuple):
+    tolerance: float
+    max_iterations: int
+    rounding: float
+    rounds: int
+
+
+def solve_active_set(
+    problem: RowProblem, good: Array, tolerance: float, max_iterations: int
+) -> tuple[ActiveSet, Bool[Array, ""]]:
+    """The last iterate, and whether H is positive definite to working precision.
+
+    Where it is not, or the problem is not ``good``, nothing is done.
 
     Args:
       problem: scaled.
       good: whether it is worth it.
-      tolerance: violation of a row, scaled, that is none [-].
-      max_iterations: limit on rows taken in and put out.
+      tolerance: violation of a row, relative, that is none [-].
+      max_iterations: limit on rows added and dropped.
     """
     n, dtype = problem.q.shape[0], problem.q.dtype
     M = problem.low.shape[0]
-    factor = jnp.linalg.cholesky(problem.H)
-    pivots = jnp.diagonal(factor)
-    definite = (pivots > (n * float(jnp.finfo(dtype).eps)) ** 0.5).all()
+    eps = float(jnp.finfo(dtype).eps)
+    curvature = jnp.max(jnp.diagonal(problem.H))
+    curvature = jnp.where(curvature > 0, curvature, 1.0)
+    factor = jnp.linalg.cholesky(problem.H / curvature)
+    definite = (jnp.diagonal(factor) > (n * eps) ** 0.5).all()
     factor = jnp.where(definite, factor, jnp.eye(n, dtype=dtype))
     # An inverse, not solves: products are what XLA does fast.
     half = solve_triangular(factor, jnp.eye(n, dtype=dtype), lower=True)
-    inverse = half.T @ half
+    inverse = half.T @ half / curvature
     zero = jnp.zeros((), jnp.int32)
-    state = _State(
+    state = ActiveSet(  # step 1
         stack=jnp.concatenate([inverse, jnp.zeros((M, n), dtype)]),
         x=-(inverse @ problem.q),
         y=jnp.zeros((M,), dtype),
-        side=jnp.zeros((M,), dtype),
-        at=zero,
+        bound_status=jnp.zeros((M,), dtype),
+        chosen=zero,
         sign=jnp.ones((), dtype),
-        more=good & definite,
+        pending=good & definite,
         infeasible=jnp.zeros((), bool),
+        rounds=zero,
         iterations=zero,
     )
-    threshold = max(tolerance, 10.0 * float(jnp.finfo(dtype).eps))
-    settings = (threshold, max_iterations)
+    settings = _Settings(
+        tolerance=max(tolerance, 10.0 * eps),
+        max_iterations=max_iterations,
+        rounding=max(10.0 * eps, min(30.0 * n * eps, 1e-11)),
+        # In float32 what a second round finds is rounding again.
+        rounds=ROUNDS if eps < 1e-12 else 1,
+    )
     state = while_any(
-        lambda state: state.more,
-        partial(_advance, settings),
-        _look(settings, state, problem),
+        lambda state: state.pending,
+        partial(_round, settings),
+        state,
         problem,
-        10.0 * float(jnp.finfo(dtype).eps) * jnp.max(jnp.diagonal(inverse)),
+        settings.rounding * jnp.max(jnp.diagonal(inverse)),
     )
-    state = _polish(problem, _polish(problem, state))
-    y = -state.side * state.y
-    return ActiveSet(state.x, y, definite, state.infeasible, state.iterations)
+    return state, definite
 
 
-def _look(settings: tuple[float, int], state: _State, problem: RowProblem) -> _State:
-    """Which row is violated most."""
-    threshold, limit = settings
+def farkas(problem: RowProblem, state: ActiveSet) -> Float[Array, "M"]:
+    """Multipliers (M,) that prove the problem infeasible, if the iterate says that it is.
+
+    The chosen normal is the sum of r times active ones, none of which may give way.
+    """
+    n = problem.q.shape[0]
+    is_chosen = jnp.arange(state.y.shape[0]) == state.chosen
+    r = state.stack[n:] @ (state.sign * problem.adjoint(is_chosen.astype(problem.q.dtype)))
+    given = jnp.where(problem.equal, r, jnp.minimum(r, 0.0))
+    return state.bound_status * given - jnp.where(is_chosen, state.sign, 0.0)
+
+
+def _round(
+    settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array
+) -> ActiveSet:
+    """Steps 2 to 4 until no row is violated, then step 5: pending again if one is violated now."""
+    found = while_any(
+        lambda state: state.pending,
+        partial(_advance, settings),
+        _choose(settings, state, problem),
+        problem,
+        rounding,
+    )
+    found = _polish(problem, _polish(problem, found))
+    found = found._replace(rounds=state.rounds + 1, pending=state.rounds < settings.rounds - 1)
+    found = _choose(settings, found, problem)
+    return jax.tree.map(lambda new, old: jnp.where(state.pending, new, old), found, state)
+
+
+def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem) -> ActiveSet:
+    """Step 2: the row that is violated most."""
     value = problem.rows(state.x)
-    inactive = state.side == 0
-    low = jnp.where((problem.has_low | problem.equal) & inactive, problem.low - value, -jnp.inf)
-    high = jnp.where((problem.has_high | problem.equal) & inactive, value - problem.high, -jnp.inf)
-    worst = jnp.maximum(low, high)
+    inactive = state.bound_status == 0
+    low, high = problem.has_low | problem.equal, problem.has_high | problem.equal
+    below = jnp.where(low & inactive, problem.low - value, -jnp.inf)
+    above = jnp.where(high & inactive, value - problem.high, -jnp.inf)
+    violation = jnp.maximum(below, above)
+    # Relative to the row's own terms; below the second number it is rounding.
+    eps = float(jnp.finfo(value.dtype).eps)
+    bound = jnp.where(below >= above, jnp.abs(problem.low), jnp.abs(problem.high))
+    size = jnp.maximum(jnp.max(jnp.abs(state.x)), 1.0)  # of x, which is 1 where it is not far out
+    # Before the first polish, rounding is that of the unconstrained minimiser.
+    curvature = jnp.max(jnp.diagonal(problem.H))
+    outside = jnp.max(jnp.abs(problem.q)) / jnp.where(curvature > 0, curvature, 1.0)
+    noise = jnp.where(state.rounds == 0, 10.0 * jnp.maximum(size, outside), 100.0 * size)
+    own = settings.tolerance * (bound + jnp.abs(value)) + eps * noise
+    violation = jnp.where(violation > own, violation, -jnp.inf)
     # Equations come first, and count even where they hold by chance.
-    worst = jnp.where(problem.equal & inactive, jnp.inf, worst)
-    at = jnp.argmax(worst).astype(jnp.int32)
-    size = jnp.maximum(jnp.max(jnp.abs(value)), 1.0)
-    more = (
-        state.more & (worst[at] > threshold * size) & (state.iterations < limit) & ~state.infeasible
+    violation = jnp.where(problem.equal & inactive, jnp.inf, violation)
+    chosen = jnp.argmax(violation).astype(jnp.int32)
+    pending = (
+        state.pending
+        & (violation[chosen] > 0)
+        & (state.iterations < settings.max_iterations)
+        & ~state.infeasible
     )
-    sign = jnp.where(low[at] >= high[at], 1.0, -1.0).astype(value.dtype)
-    return state._replace(at=at, sign=sign, more=more)
+    sign = jnp.where(below[chosen] >= above[chosen], 1.0, -1.0).astype(value.dtype)
+    # What could not be made to hold is kept, for the proof.
+    return state._replace(
+        chosen=jnp.where(state.infeasible, state.chosen, chosen),
+        sign=jnp.where(state.infeasible, state.sign, sign),
+        pending=pending,
+    )
 
 
 def _advance(
-    settings: tuple[float, int], state: _State, problem: RowProblem, rounding: Array
-) -> _State:
-    """Take in a row, or put out the one that is in its way."""
+    settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array
+) -> ActiveSet:
+    """Steps 3 and 4: add the chosen row, or drop the one that is in its way; then step 2."""
     n, dtype = problem.q.shape[0], problem.q.dtype
     eps = float(jnp.finfo(dtype).eps)
-    more = state.more
+    pending = state.pending
     U = state.stack[n:]
     index = jnp.arange(state.y.shape[0], dtype=jnp.int32)
-    here = (index == state.at).astype(dtype)
-    normal = state.sign * problem.adjoint(here)
-    pushed = state.stack @ normal
-    z, r = pushed[:n], pushed[n:]
-    bend = z @ normal
-    wanted = here @ jnp.where(state.sign > 0, problem.low, problem.high)
-    miss = state.sign * (wanted - here @ problem.rows(state.x))
-    # Rows of equations never leave; their normals may push either way.
-    may_leave = (state.side != 0) & ~problem.equal & (r > eps)
-    ratio = jnp.where(may_leave, state.y / jnp.where(may_leave, r, 1.0), jnp.inf)
-    leaving = jnp.argmin(ratio).astype(jnp.int32)
-    until_out = ratio[leaving]
-    # A row that depends on the active ones moves nothing: rounding alone is left of its bend.
-    depends = bend <= rounding
-    until_in = jnp.where(depends, jnp.inf, jnp.maximum(miss, 0.0) / jnp.where(depends, 1.0, bend))
-    step = jnp.minimum(until_in, until_out)
-    # An equation that follows from others and holds already is not in anyone's way.
+    is_chosen = (index == state.chosen).astype(dtype)
+    normal = state.sign * problem.adjoint(is_chosen)
+    moves = state.stack @ normal
+    z, r = moves[:n], moves[n:]
+    curvature = z @ normal
+    wanted = is_chosen @ jnp.where(state.sign > 0, problem.low, problem.high)
+    value = is_chosen @ problem.rows(state.x)
+    violation = state.sign * (wanted - value)
+    # Rows of equations are never dropped; their normals may push either way.
+    may_drop = (state.bound_status != 0) & ~problem.equal & (r > eps)
+    ratio = jnp.where(may_drop, state.y / jnp.where(may_drop, r, 1.0), jnp.inf)
+    dropped = jnp.argmin(ratio).astype(jnp.int32)
+    t_drop = ratio[dropped]
+    # A row that depends on the active ones moves nothing: rounding alone is left of its curvature.
+    depends = curvature <= rounding
+    t_add = jnp.where(
+        depends, jnp.inf, jnp.maximum(violation, 0.0) / jnp.where(depends, 1.0, curvature)
+    )
+    step = jnp.minimum(t_add, t_drop)
+    # An equation that follows from others and holds already is in no one's way.
     stuck = ~jnp.isfinite(step)
-    redundant = stuck & (miss <= 1e3 * eps * n)
-    entering = until_in <= until_out
-    t = jnp.where(more & ~stuck, step, 0.0)
+    size = jnp.abs(wanted) + jnp.max(jnp.abs(state.x))
+    redundant = stuck & (violation <= 1e3 * eps * n * size)
+    adds = t_add <= t_drop
+    t = jnp.where(pending & ~stuck, step, 0.0)
 
     x = state.x + jnp.where(depends, 0.0, t) * z
-    y = jnp.maximum(state.y - t * r, jnp.where(problem.equal, -jnp.inf, 0.0)) + t * here
-    out = (index == leaving).astype(dtype)
-    u = out @ U
+    y = jnp.maximum(state.y - t * r, jnp.where(problem.equal, -jnp.inf, 0.0)) + t * is_chosen
+    is_dropped = (index == dropped).astype(dtype)
+    u = is_dropped @ U
     Hu = problem.H @ u
-    kept = u @ Hu
-    # Entering: the new row is active and P loses z. Leaving: P gains u back.
-    put_in, put_out = more & ~stuck & entering, more & ~stuck & ~entering
-    inwards = jnp.concatenate([z, r - here]) / jnp.where(put_in, bend, 1.0)
-    outwards = jnp.concatenate([-u, U @ Hu]) / jnp.where(put_out, kept, 1.0)
-    left = jnp.where(put_in, inwards, jnp.where(put_out, outwards, 0.0))
-    stack = state.stack - left[:, None] * jnp.where(put_in, z, u)[None, :]
-    side = state.side + jnp.where(put_in, state.sign, 0.0) * here
-    side = jnp.where(put_out, side * (1.0 - out), side)
-    y = jnp.where(put_out, y * (1.0 - out), y)
+    uHu = u @ Hu
+    # Added: the new row is active and P loses z. Dropped: P gains u back.
+    add, drop = pending & ~stuck & adds, pending & ~stuck & ~adds
+    by_add = jnp.concatenate([z, r - is_chosen]) / jnp.where(add, curvature, 1.0)
+    by_drop = jnp.concatenate([-u, U @ Hu]) / jnp.where(drop, uHu, 1.0)
+    column = jnp.where(add, by_add, jnp.where(drop, by_drop, 0.0))
+    stack = state.stack - column[:, None] * jnp.where(add, z, u)[None, :]
+    bound_status = state.bound_status + jnp.where(add, state.sign, 0.0) * is_chosen
+    bound_status = jnp.where(drop, bound_status * (1.0 - is_dropped), bound_status)
+    y = jnp.where(drop, y * (1.0 - is_dropped), y)
+    fails = pending & stuck & ~redundant
     moved = state._replace(
         stack=stack,
         x=x,
         y=y,
-        side=jnp.where(more & redundant, side + state.sign * here, side),
-        infeasible=state.infeasible | (more & stuck & ~redundant),
-        iterations=state.iterations + more,
+        bound_status=jnp.where(
+            pending & redundant, bound_status + state.sign * is_chosen, bound_status
+        ),
+        infeasible=state.infeasible | fails,
+        iterations=state.iterations + pending,
     )
-    looked = _look(settings, moved, problem)
-    # A row that could not come in yet is tried again.
-    again = put_out & (moved.iterations < settings[1])
-    return looked._replace(
-        at=jnp.where(put_out, state.at, looked.at),
-        sign=jnp.where(put_out, state.sign, looked.sign),
-        more=jnp.where(put_out, again, looked.more),
+    chosen = _choose(settings, moved, problem)
+    # A row that could not be added yet is tried again.
+    again = drop & (moved.iterations < settings.max_iterations)
+    return chosen._replace(
+        chosen=jnp.where(drop, state.chosen, chosen.chosen),
+        sign=jnp.where(drop, state.sign, chosen.sign),
+        pending=jnp.where(drop, again, chosen.pending),
     )
 
 
-def _polish(problem: RowProblem, state: _State) -> _State:
+def _polish(problem: RowProblem, state: ActiveSet) -> ActiveSet:
     """A Newton step of the equations that the active rows make, for what rounding has left."""
     n = problem.q.shape[0]
     P, U = state.stack[:n], state.stack[n:]
-    force = problem.adjoint(state.side * state.y)
-    r = force - problem.H @ state.x - problem.q
-    wanted = jnp.where(state.side > 0, problem.low, problem.high)
-    gap = jnp.where(state.side != 0, state.side * (wanted - problem.rows(state.x)), 0.0)
-    gap = jnp.where(jnp.abs(U).max(axis=1) > 0, gap, 0.0)
-    dx = P @ r + U.T @ gap
-    return state._replace(x=state.x + dx, y=state.y + U @ (problem.H @ dx - r))
+    push = problem.adjoint(state.bound_status * state.y)
+    r_dual = push - problem.H @ state.x - problem.q
+    wanted = jnp.where(state.bound_status > 0, problem.low, problem.high)
+    active = (state.bound_status != 0) & (jnp.abs(U).max(axis=1) > 0)
+    r_primal = jnp.where(active, state.bound_status * (wanted - problem.rows(state.x)), 0.0)
+    dx = P @ r_dual + U.T @ r_primal
+    return state._replace(x=state.x + dx, y=state.y + U @ (problem.H @ dx - r_dual))

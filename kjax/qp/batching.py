@@ -48,7 +48,8 @@ def where_needed(
     """``function(value, *args)`` where it is needed, else ``value``.
 
     Like ``lax.cond``, which under ``vmap`` computes both sides for everyone; this computes
-    ``function`` for a batch only if a member needs it.
+    ``function`` for a batch only if a member needs it, and on a CPU in pieces that hold none but
+    the members that do.
     """
 
     @custom_vmap
@@ -66,7 +67,28 @@ def where_needed(
                 needed, new, value
             )
 
-        out = jax.lax.cond(needed.any(), some, lambda: value)
+        def piece(order: Array, i: Array, out: Any) -> Any:
+            index = jax.lax.dynamic_slice_in_dim(order, i * CHUNK, CHUNK)
+            old, chosen = jax.tree.map(lambda leaf: leaf[index], (value, needed))
+            mine = jax.tree.map(
+                lambda leaf, there: leaf[index] if there else leaf, args, in_batched[2]
+            )
+            new = jax.vmap(lambda v, a: function(v, *a), in_axes=(0, axes))(old, mine)
+            return jax.tree.map(
+                lambda out, new, old: out.at[index].set(
+                    jnp.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                ),
+                out, new, old,
+            )  # fmt: skip
+
+        if axis_size > CHUNK and jax.default_backend() == "cpu":
+            # Those that need it first; the last index fills the last piece up.
+            order = jnp.argsort(~needed, stable=True)
+            order = jnp.concatenate([order, jnp.full((CHUNK,), order[-1])])
+            pieces = (needed.sum() + CHUNK - 1) // CHUNK
+            out = jax.lax.fori_loop(0, pieces, lambda i, out: piece(order, i, out), value)
+        else:
+            out = jax.lax.cond(needed.any(), some, lambda: value)
         return out, jax.tree.map(lambda _: True, out)
 
     return chosen(needed, value, args)

@@ -21,7 +21,7 @@ from kjax.qp.problem import (
     Solution,
     Status,
     Warm,
-    natural_residual,
+    box_error,
     no_tangent,
     start,
     swept,
@@ -212,15 +212,15 @@ def _solve(
     x = jnp.clip(found.x * d, lower, upper)
     x = jnp.where(found.x <= low, lower, jnp.where(found.x >= high, upper, x))
     x = jnp.where(good, x, jnp.clip(guess, inner, outer))
-    lost = jnp.where(good, 0.0, jnp.inf).astype(q.dtype)
+    unusable = jnp.where(good, 0.0, jnp.inf).astype(q.dtype)
     solution = Solution(
         x=x,
         multipliers=jnp.where(good, y / d, 0.0),
         status=status.astype(jnp.int32),
-        residual=found.residual + lost,
-        primal=lost,
-        dual=jnp.max(jnp.abs(gradient + y)) / size + lost,
-        gap=lost,
+        residual=found.residual + unusable,
+        primal=unusable,
+        dual=found.residual + unusable,
+        gap=unusable,
         margin=jnp.where(good, jnp.min(slack) / size, 0.0),
         iterations=found.iterations,
         warm=Warm(x=x, table=found.table, side=found.side),
@@ -254,16 +254,16 @@ class _Box(NamedTuple):
     upper: Array
 
     def residual(self, x: Array) -> Array:
-        return natural_residual(self.H, self.q, self.lower, self.upper, x)
+        return box_error(self.H, self.q, self.lower, self.upper, x)
 
 
 class _Tried(NamedTuple):
-    """Where pivoting has led; ``lost`` if its tableau was of no use."""
+    """Where pivoting has led; ``corrupted`` if its tableau was of no use."""
 
     x: Array
     residual: Array
     iterations: Array
-    lost: Array
+    corrupted: Array
 
 
 def _by_pivoting(
@@ -276,20 +276,24 @@ def _by_pivoting(
     tolerance: float,
 ) -> _Found:
     """Pivot from the warm start; where rounding has spoilt its tableau, once more from the cold."""
-    # The point's size is not known yet; bounds that keep it from 0 are a part of it.
-    least = jnp.maximum(jnp.maximum(lower, -upper), 0.0)
-    size = jnp.maximum(jnp.max(jnp.abs(q)), jnp.max(least))
+    # The point's size is not known yet; bounds that keep it from 0 are a part of it, and a box
+    # around it limits it.
+    least = jnp.max(jnp.maximum(jnp.maximum(lower, -upper), 0.0))
+    widest = jnp.maximum(jnp.abs(lower), jnp.abs(upper))
+    size = jnp.maximum(jnp.max(jnp.abs(q)), least)
+    size = jnp.where(jnp.isfinite(size), size, 0.0)
     # Far below the tolerance, which the condition multiplies on its way to x.
-    rounding = 10.0 * float(jnp.finfo(q.dtype).eps)
-    threshold = max(rounding, 1e-3 * tolerance) * jnp.where(jnp.isfinite(size), size, 0.0)
+    eps = float(jnp.finfo(q.dtype).eps)
+    relative = max(10.0 * eps, 1e-3 * tolerance)
     limit = min(settings.max_iterations, 10 * q.shape[0])
+    threshold = relative * jnp.minimum(size, widest), relative * size
 
     box = _Box(prepared.H, q, lower, upper)
     first = pivot(warm.table, warm.side, q, lower, upper, threshold=threshold, limit=limit)
     attempt = _try(box, first)
     tried = where_needed(
         ~(attempt.residual <= tolerance),
-        partial(_mend, tolerance, limit),
+        partial(_refactorise, tolerance, limit),
         attempt,
         box,
         first,
@@ -301,15 +305,15 @@ def _by_pivoting(
         x=tried.x,
         residual=tried.residual,
         iterations=tried.iterations,
-        table=jnp.where(tried.lost, prepared.table, first.table),
-        side=jnp.where(tried.lost, prepared.side, first.side),
-        current=~tried.lost,
+        table=jnp.where(tried.corrupted, prepared.table, first.table),
+        side=jnp.where(tried.corrupted, prepared.side, first.side),
+        current=~tried.corrupted,
     )
 
 
 def _try(box: _Box, done: Pivoted) -> _Tried:
     x = done.point(box.lower, box.upper)
-    return _Tried(x, box.residual(x), done.exchanges, lost=jnp.zeros((), bool))
+    return _Tried(x, box.residual(x), done.exchanges, corrupted=jnp.zeros((), bool))
 
 
 def _polish(box: _Box, tried: _Tried, done: Pivoted) -> _Tried:
@@ -323,7 +327,7 @@ def _polish(box: _Box, tried: _Tried, done: Pivoted) -> _Tried:
     return tried._replace(x=x, residual=residual)
 
 
-def _mend(
+def _refactorise(
     tolerance: float,
     limit: int,
     tried: _Tried,
@@ -331,20 +335,30 @@ def _mend(
     first: Pivoted,
     table: Array,
     side: Array,
-    threshold: Array,
+    threshold: tuple[Array, Array],
 ) -> _Tried:
-    """Polish; if that does not do, pivot from the cold start, and take the better point."""
+    """Polish; if that does not do, pivot from the cold start, and take the better point.
+
+    Then with thresholds of every variable's own, as q and the bounds may spread over many decades.
+    """
     old = _polish(box, _polish(box, tried, first), first)
-    lost = ~(old.residual <= tolerance)
-    # Where nothing is lost no exchange is worth it, which saves a batch the waiting.
-    far = jnp.where(lost, threshold, jnp.inf)
+    corrupted = ~(old.residual <= tolerance)
+    widest = jnp.maximum(jnp.abs(box.lower), jnp.abs(box.upper))
+    eps = float(jnp.finfo(box.q.dtype).eps)
+    relative = max(10.0 * eps, 1e-3 * tolerance)
+    own = tuple(
+        jnp.clip(relative * part, eps / relative * whole, whole)
+        for part, whole in zip((widest, jnp.abs(box.q)), threshold, strict=True)
+    )
+    # Where nothing is corrupted no exchange is worth it, which saves a batch the waiting.
+    own = jnp.where(corrupted, own[0], jnp.inf), jnp.where(corrupted, own[1], jnp.inf)
     left = limit - first.exchanges
-    again = pivot(table, side, box.q, box.lower, box.upper, threshold=far, limit=left)
+    again = pivot(table, side, box.q, box.lower, box.upper, threshold=own, limit=left)
     new = _polish(box, _try(box, again), again)
-    better = lost & ~(old.residual <= new.residual)
+    better = corrupted & ~(old.residual <= new.residual)
     return _Tried(
         x=jnp.where(better, new.x, old.x),
         residual=jnp.where(better, new.residual, old.residual),
         iterations=old.iterations + new.iterations,
-        lost=lost,
+        corrupted=corrupted,
     )

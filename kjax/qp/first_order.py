@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from kjax.qp.problem import Prepared, natural_residual
+from kjax.qp.problem import Prepared, box_error
 
 
 class _Box(NamedTuple):
@@ -98,7 +98,7 @@ def descend(
     iteration = method(prepared, box)
 
     def residual(x: Array) -> Array:
-        return natural_residual(prepared.H, box.q, box.lower, box.upper, x)
+        return box_error(prepared.H, box.q, box.lower, box.upper, x)
 
     def unfinished(carry: Any) -> Array:
         _, _, error, count = carry

@@ -1,7 +1,16 @@
-"""Primal-dual interior point on the scaled problem of ``qp.rows``: Mehrotra's predictor-corrector.
+"""Primal-dual interior point (Mehrotra 1992) on the scaled problem of ``qp.row_problem``.
 
-Slacks of every finite side; rows with equal bounds are equations. Memory and time are those of one
-dense Cholesky of H + C^T W C per iteration, and some ten iterations are usual. H may be singular.
+Every finite side has a slack s and a multiplier z; rows with equal bounds are equations with
+multiplier y. H may be singular.
+
+1. Start at the point nearest to the middle of all bounds, s and z clear of zero.
+2. Stop where the residuals of the point, clipped to the box, are within the tolerance.
+3. Predictor: Newton's step towards s z = 0; mu_affine is what it would leave of mu.
+4. Corrector: Newton's step towards s z = sigma mu, sigma = (mu_affine / mu)^3, with the
+   predictor's second-order term.
+5. Go 0.99 or more of the way to the boundary, and to step 2.
+
+Memory and time are those of one dense Cholesky of H + C^T W C per iteration; some ten are usual.
 """
 
 from typing import Any, NamedTuple
@@ -11,7 +20,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
-from kjax.qp.row_problem import RowProblem, residuals
+from kjax.qp.row_problem import RowProblem
 
 
 class _Point(NamedTuple):
@@ -27,31 +36,30 @@ class _Point(NamedTuple):
 
 def descend_central_path(
     problem: RowProblem, good: Array, *, tolerance: float, max_iterations: int
-) -> tuple[Float[Array, "n"], Float[Array, "M"], Float[Array, "3"], Int[Array, ""]]:
-    """Best point, its multipliers, its residuals and the iterations spent; nothing if not good."""
+) -> tuple[Float[Array, "n"], Float[Array, "M"], Int[Array, ""]]:
+    """Best point, its multipliers and the iterations spent; nothing is done if not good."""
     n = problem.q.shape[0]
     # A ridge far below the tolerance lets a singular H through.
     ridge = float(10.0 * n * jnp.finfo(problem.q.dtype).eps)
-    start = _start(problem)
-    first = _residuals(problem, start)
+    start = _start(problem)  # step 1
+    first = _error(problem, start)
 
-    def unfinished(carry: Any) -> Array:
-        _, _, error, _, count, moving = carry
-        return (jnp.max(error) > tolerance) & (count < max_iterations) & moving
+    def unfinished(carry: Any) -> Array:  # step 2
+        _, _, error, count, moving = carry
+        return ~(error <= tolerance) & (count < max_iterations) & moving
 
     def advance(carry: Any) -> Any:
-        point, best, error, _, count, _ = carry
+        point, best, error, count, _ = carry
         moved, ok = _iterate(problem, point, ridge)
-        new = _residuals(problem, moved)
-        better = ok & (jnp.max(new) < jnp.max(error))
+        new = _error(problem, moved)
+        better = ok & (new < error)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, best)
-        error = jnp.where(better, new, error)
-        return moved, best, error, new, count + 1, ok
+        return moved, best, jnp.where(better, new, error), count + 1, ok
 
-    _, best, error, _, count, _ = jax.lax.while_loop(
-        unfinished, advance, (start, start, first, first, jnp.zeros((), jnp.int32), good)
+    _, best, _, count, _ = jax.lax.while_loop(
+        unfinished, advance, (start, start, first, jnp.zeros((), jnp.int32), good)
     )
-    return best.x, _multipliers(best), error, count
+    return best.x, _multipliers(best), count
 
 
 def _factor(problem: RowProblem, weight: Array, ridge: float) -> Array:
@@ -69,7 +77,7 @@ def _solve(half: Array, right: Array) -> Array:
 
 
 def _start(problem: RowProblem) -> _Point:
-    """The point that is nearest to all bounds' middles, slacks and duals clear of zero."""
+    """Step 1."""
     one_low, one_high = (
         has & ~other
         for has, other in ((problem.has_low, problem.has_high), (problem.has_high, problem.has_low))
@@ -95,29 +103,32 @@ def _multipliers(point: _Point) -> Array:
     return point.z_high - point.z_low + point.y
 
 
-def _residuals(problem: RowProblem, point: _Point) -> Array:
-    return residuals(problem, point.x, _multipliers(point))
+def _error(problem: RowProblem, point: _Point) -> Array:
+    m = problem.C.shape[0]
+    low, high = problem.bounds()
+    x = jnp.clip(point.x, low[m:], high[m:])
+    return jnp.max(problem.errors(x, _multipliers(point)))
 
 
 def _iterate(problem: RowProblem, point: _Point, ridge: float) -> tuple[_Point, Array]:
-    """One predictor-corrector step; the flag tells whether it could be taken."""
+    """Steps 3 to 5; the flag tells whether the step could be taken."""
     low, high, equal = problem.has_low, problem.has_high, problem.equal
     s_low, s_high, z_low, z_high = point[1:5]
     value = problem.rows(point.x)
-    dual = problem.H @ point.x + problem.q + problem.adjoint(_multipliers(point))
-    miss_low = jnp.where(low, value - problem.low - s_low, 0.0)
-    miss_high = jnp.where(high, problem.high - value - s_high, 0.0)
-    miss = jnp.where(equal, value - problem.low, 0.0)
-    # Proximal step of the equations' multipliers: the equations hold better by sqrt(eps) each time.
-    stiff = jnp.where(equal, jnp.finfo(value.dtype).eps ** -0.5, 0.0)
-    weight = z_low / s_low + z_high / s_high + stiff
+    r_dual = problem.H @ point.x + problem.q + problem.adjoint(_multipliers(point))
+    r_low = jnp.where(low, value - problem.low - s_low, 0.0)
+    r_high = jnp.where(high, problem.high - value - s_high, 0.0)
+    r_equal = jnp.where(equal, value - problem.low, 0.0)
+    # Proximal step of the equations' multipliers: they hold better by sqrt(eps) each time.
+    rho = jnp.where(equal, jnp.finfo(value.dtype).eps ** -0.5, 0.0)
+    weight = z_low / s_low + z_high / s_high + rho
     factor = _factor(problem, weight, ridge)
 
     def direction(target_low: Array, target_high: Array) -> _Point:
         """Newton's step towards s z = target on either side."""
-        push_low = jnp.where(low, (target_low - z_low * miss_low) / s_low - z_low, 0.0)
-        push_high = jnp.where(high, (target_high - z_high * miss_high) / s_high - z_high, 0.0)
-        right = -dual + problem.adjoint(push_low - push_high - stiff * miss)
+        push_low = jnp.where(low, (target_low - z_low * r_low) / s_low - z_low, 0.0)
+        push_high = jnp.where(high, (target_high - z_high * r_high) / s_high - z_high, 0.0)
+        right = -r_dual + problem.adjoint(push_low - push_high - rho * r_equal)
         dx = _solve(factor, right)
         # One refinement: the weights spread over many decades near the solution.
         error = right - (problem.H @ dx + problem.adjoint(weight * problem.rows(dx)))
@@ -125,11 +136,11 @@ def _iterate(problem: RowProblem, point: _Point, ridge: float) -> tuple[_Point, 
         move = problem.rows(dx)
         return _Point(
             x=dx,
-            s_low=jnp.where(low, move + miss_low, 0.0),
-            s_high=jnp.where(high, -move + miss_high, 0.0),
+            s_low=jnp.where(low, move + r_low, 0.0),
+            s_high=jnp.where(high, -move + r_high, 0.0),
             z_low=push_low - jnp.where(low, z_low / s_low * move, 0.0),
             z_high=push_high + jnp.where(high, z_high / s_high * move, 0.0),
-            y=stiff * (move + miss),
+            y=rho * (move + r_equal),
         )
 
     def longest(step: _Point) -> Array:
@@ -145,19 +156,19 @@ def _iterate(problem: RowProblem, point: _Point, ridge: float) -> tuple[_Point, 
         return jnp.minimum(jnp.min(jnp.stack(ratios), initial=jnp.inf), 1.0)
 
     count = jnp.maximum(jnp.sum(low) + jnp.sum(high), 1)
-    mean = (
+    mu = (
         jnp.sum(jnp.where(low, s_low * z_low, 0.0)) + jnp.sum(jnp.where(high, s_high * z_high, 0.0))
     ) / count
-    affine = direction(jnp.zeros_like(s_low), jnp.zeros_like(s_high))
+    affine = direction(jnp.zeros_like(s_low), jnp.zeros_like(s_high))  # step 3
     a = longest(affine)
-    after = (
+    mu_affine = (
         jnp.sum(jnp.where(low, (s_low + a * affine.s_low) * (z_low + a * affine.z_low), 0.0))
         + jnp.sum(jnp.where(high, (s_high + a * affine.s_high) * (z_high + a * affine.z_high), 0.0))
     ) / count
-    centre = mean * jnp.clip(after / jnp.where(mean > 0, mean, 1.0), 0.0, 1.0) ** 3
-    step = direction(centre - affine.s_low * affine.z_low, centre - affine.s_high * affine.z_high)
-    a = longest(step)
-    a = jnp.where(a < 1.0, jnp.maximum(0.99, 1.0 - mean) * a, 1.0)
+    target = mu * jnp.clip(mu_affine / jnp.where(mu > 0, mu, 1.0), 0.0, 1.0) ** 3  # step 4
+    step = direction(target - affine.s_low * affine.z_low, target - affine.s_high * affine.z_high)
+    a = longest(step)  # step 5
+    a = jnp.where(a < 1.0, jnp.maximum(0.99, 1.0 - mu) * a, 1.0)
     moved = jax.tree.map(lambda v, d: v + a * d, point, step)
     ok = jnp.stack([jnp.isfinite(leaf).all() for leaf in moved]).all()
     return jax.tree.map(lambda new, old: jnp.where(ok, new, old), moved, point), ok

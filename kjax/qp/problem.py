@@ -3,9 +3,10 @@
     minimise  1/2 x^T H x + q^T x   subject to  lower <= x <= upper,   H positive definite
 
 Everything is measured in Jacobi-scaled coordinates x_hat = x / d with d = diag(H)^-1/2, in which H
-has a unit diagonal and x_hat, its gradient and q share one unit. The residual is relative to the
-size of q_hat and x_hat, so it does not change when H and q are multiplied by any number or when
-the unit of x does.
+has a unit diagonal. What is left of a gradient is judged against the two terms that it is the sum
+of, H x and q, variable by variable, and a distance from a bound against the point: so the residual
+does not change when H and q are multiplied by any number, when the unit of x does, or when the box
+is small beside the unconstrained minimiser.
 """
 
 from enum import IntEnum
@@ -27,6 +28,7 @@ class Status(IntEnum):
     NON_FINITE = 3
     NOT_POSITIVE_DEFINITE = 4
     INFEASIBLE = 5
+    UNBOUNDED = 6
 
 
 STATUS_TEXT = {
@@ -36,6 +38,7 @@ STATUS_TEXT = {
     Status.NON_FINITE: "H, q or a bound holds NaN, or H or q infinity",
     Status.NOT_POSITIVE_DEFINITE: "H is not positive definite to working precision",
     Status.INFEASIBLE: "no point keeps all rows and bounds",
+    Status.UNBOUNDED: "the cost has no lower end within the rows and bounds",
 }
 
 
@@ -199,24 +202,46 @@ def kkt_residual(
     upper: Float[Array, "n"],
     x: Float[Array, "n"],
 ) -> Float[Array, ""]:
-    """Relative natural residual |x - clip(x - grad)|_inf of the Jacobi-scaled problem.
+    """Relative KKT residual of any point: zero exactly at the minimiser, continuous around it.
 
-    It is zero exactly at the minimiser: there a free variable has no gradient, and at a bound the
-    gradient pushes against the bound. Relative to max(|q_hat|, |x_hat|).
+    Of every variable the median of (x - upper, gradient, x - lower): there a free variable has no
+    gradient, and at a bound the gradient pushes against the bound. Gradients are relative to
+    max(|H| |x|, |q|) of their own variable, distances to max(|x_hat|).
     """
     scale = 1.0 / jnp.sqrt(jnp.diagonal(H))
     scaled = H * scale[:, None] * scale[None, :]
-    return natural_residual(scaled, q * scale, lower / scale, upper / scale, x / scale)
+    low, high, point = lower / scale, upper / scale, x / scale
+    terms = jnp.maximum(jnp.abs(scaled) @ jnp.abs(point), jnp.abs(q * scale))
+    slope = relative_gradient(scaled, q * scale, point, terms)
+    size = jnp.max(jnp.abs(point))
+    size = jnp.where(size > 0, size, 1.0)
+    below, above = (point - low) / size, (point - high) / size
+    return jnp.max(jnp.abs(jnp.maximum(above, jnp.minimum(slope, below))))
 
 
-def natural_residual(
+def relative_gradient(
+    H: Float[Array, "n n"], q: Float[Array, "n"], x: Float[Array, "n"], terms: Float[Array, "n"]
+) -> Float[Array, "n"]:
+    """Gradient of the scaled problem less what rounding leaves of it, relative to ``terms``."""
+    gradient = H @ x + q
+    n, eps = q.shape[0], float(jnp.finfo(q.dtype).eps)
+    noise = 4.0 * n**0.5 * eps * jnp.maximum(jnp.max(jnp.abs(q)), jnp.max(jnp.abs(x)))
+    excess = jnp.maximum(jnp.abs(gradient) - noise, 0.0)
+    return jnp.sign(gradient) * excess / jnp.where(terms > 0, terms, 1.0)
+
+
+def box_error(
     H: Float[Array, "n n"],
     q: Float[Array, "n"],
     lower: Float[Array, "n"],
     upper: Float[Array, "n"],
     x: Float[Array, "n"],
 ) -> Float[Array, ""]:
-    """``kkt_residual`` for a problem that is scaled already."""
-    step = x - jnp.clip(x - (H @ x + q), lower, upper)
-    size = jnp.maximum(jnp.max(jnp.abs(q)), jnp.max(jnp.abs(x)))
-    return jnp.max(jnp.abs(step)) / jnp.where(size > 0, size, 1.0)
+    """Residual of a point of the scaled problem that is inside the box, bounds to the last bit.
+
+    Unlike ``kkt_residual`` it takes a variable to be at a bound only where it is. Of |H| |x| the
+    diagonal's part alone, which saves a product with H.
+    """
+    slope = relative_gradient(H, q, x, jnp.maximum(jnp.abs(x), jnp.abs(q)))
+    held = ((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0))
+    return jnp.max(jnp.where(held, 0.0, jnp.abs(slope)))

@@ -1,8 +1,8 @@
-"""The QP with general rows in the coordinates that its solvers work in.
+"""The QP with general rows in the coordinates that its solvers work in, and what judges a point.
 
-M = m + n rows, the box after those of C. Here H has a unit diagonal, every row of C unit length and
-q unit size, so a common factor of H and q, or another unit of x, changes nothing. Fixed variables
-are taken out.
+M = m + n rows, the box after those of C. Every row of C has unit length, and x is measured in
+units of its own expected size, the cost in units of its largest term there. So a common factor of
+H and q, or another unit of x, changes nothing. Fixed variables are taken out.
 """
 
 from typing import NamedTuple
@@ -37,6 +37,18 @@ class RowProblem(NamedTuple):
         m = self.C.shape[0]
         return (self.C.T * w[:m]) @ self.C + jnp.diag(w[m:])
 
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds (m + n,), infinite where there is none."""
+        low = jnp.where(self.has_low | self.equal, self.low, -jnp.inf)
+        return low, jnp.where(self.has_high | self.equal, self.high, jnp.inf)
+
+    def errors(self, x: Array, y: Array) -> Array:
+        """``kkt_errors`` of a point and its multipliers."""
+        low, high = self.bounds()
+        one = jnp.ones_like(low)
+        x = snapped(x)
+        return kkt_errors(self.H, self.q, self.C, low, high, one[: len(x)], one, x, y)[0]
+
 
 class RowScaling(NamedTuple):
     """From the scaled problem back to the caller's.
@@ -44,14 +56,47 @@ class RowScaling(NamedTuple):
     Attributes:
       x: (n,) x = x_hat * x + at.
       multipliers: (m + n,) of the rows and the box.
+      values: (m + n,) of the values of rows and box.
       at: (n,) values of the fixed variables, 0 elsewhere.
       fixed: (n,) variables whose bounds are equal.
+      immovable: (m,) rows that no free variable can move.
     """
 
     x: Float[Array, "n"]
     multipliers: Float[Array, "M"]
+    values: Float[Array, "M"]
     at: Float[Array, "n"]
     fixed: Bool[Array, "n"]
+    immovable: Bool[Array, "m"]
+
+
+def snapped(x: Float[Array, "n"]) -> Float[Array, "n"]:
+    """The scaled point, what is rounding beside its expected size 1 set to 0.
+
+    At the tip of a friction cone all terms of a row vanish: there nothing but 0 keeps it.
+    """
+    rounding = 16.0 * x.shape[0] ** 0.5 * float(jnp.finfo(x.dtype).eps)
+    return jnp.where(jnp.abs(x) <= rounding, 0.0, x)
+
+
+def variable_units(
+    H: Float[Array, "n n"], C: Float[Array, "m n"], free: Bool[Array, "n"]
+) -> Float[Array, "n"]:
+    """Units d (n,) of the variables: by Jacobi where there is curvature, by the rows elsewhere."""
+    eps = jnp.finfo(H.dtype).eps
+    curvature = jnp.diagonal(H)
+    largest = jnp.max(jnp.where(free, curvature, 0.0), initial=0.0)
+    curved = (curvature > eps * largest) & (largest > 0)
+    d = jnp.where(curved, jnp.sqrt(largest / jnp.where(curved, curvature, 1.0)), 1.0)
+    if C.shape[0] == 0:
+        return d
+    # Ruiz equilibration of the columns that H says nothing about.
+    size = jnp.abs(C) * free
+    for _ in range(3):
+        row = jnp.max(size * d, axis=1, keepdims=True)
+        column = jnp.max(size / jnp.where(row > 0, row, 1.0), axis=0)
+        d = jnp.where(curved | ~(column > 0), d, 1.0 / jnp.where(column > 0, column, 1.0))
+    return d
 
 
 def scale_rows(
@@ -60,34 +105,43 @@ def scale_rows(
     C: Float[Array, "m n"],
     low: Float[Array, "M"],
     high: Float[Array, "M"],
+    *,
+    equilibrate: bool = True,
 ) -> tuple[RowProblem, RowScaling]:
-    """Scaled problem of finite data with consistent bounds; H symmetric."""
+    """Scaled problem of finite data with consistent bounds; H symmetric.
+
+    ``equilibrate`` is for variables without curvature, whose unit then comes from the rows.
+    """
     m = C.shape[0]
-    eps = jnp.finfo(q.dtype).eps
-    diagonal = jnp.diagonal(H)
-    largest = jnp.maximum(jnp.max(jnp.abs(diagonal)), jnp.finfo(q.dtype).tiny)
-    d = 1.0 / jnp.sqrt(jnp.where(diagonal > eps * largest, diagonal, largest))
     fixed = low[m:] == high[m:]
-    at = jnp.where(fixed, low[m:], 0.0)
-    # Fixed variables leave: their columns act through q and the rows' bounds, and they keep a unit
-    # diagonal of their own.
     free = ~fixed
-    linear = jnp.where(free, q + H @ at, 0.0)
+    at = jnp.where(fixed, low[m:], 0.0)
+    d = variable_units(H, C[: len(C) * equilibrate], free)
+    # Fixed variables leave: their columns act through q and the rows' bounds.
+    linear = jnp.where(free, q + H @ at, 0.0) * d
     C_free = C * d * free
     length = jnp.linalg.norm(C_free, axis=1)
-    row = 1.0 / jnp.where(length > 0, length, 1.0)
-    unit = jnp.max(jnp.abs(linear * d))
-    unit = jnp.where(unit > 0, unit, 1.0)  # of x_hat, and so of everything
+    immovable = length == 0
+    length = jnp.where(immovable, 1.0, length)
     shift = jnp.concatenate([C @ at, at])
-    scale = jnp.concatenate([row, 1.0 / d]) / unit
-    low_hat, high_hat = (low - shift) * scale, (high - shift) * scale
-    # An empty row, or a fixed variable, leaves nothing to decide there.
-    off = jnp.concatenate([length == 0, fixed])
+    off = jnp.concatenate([immovable, fixed])
+    unit_of_row = jnp.concatenate([length, d])
+    low_hat, high_hat = (low - shift) / unit_of_row, (high - shift) / unit_of_row
+
+    h = jnp.max(jnp.where(free, jnp.diagonal(H) * d**2, 0.0), initial=0.0)
+    slope = jnp.max(jnp.abs(linear))
+    sigma = _expected_size(slope, h, low_hat, high_hat, off, m)
+    cost = jnp.maximum(h * sigma, slope)
+    cost = jnp.where(cost > 0, cost, 1.0)
+    own = jnp.where(h > 0, h, 1.0) * (sigma / cost)  # diagonal of a fixed variable
+
+    low_hat, high_hat = low_hat / sigma, high_hat / sigma
     equal = (low == high) & ~off
     problem = RowProblem(
-        H=H * (d[:, None] * d) * (free[:, None] & free) + jnp.diag(fixed.astype(d.dtype)),
-        q=linear * d / unit,
-        C=C_free * row[:, None],
+        H=H * (d[:, None] * d) * (free[:, None] & free) * (sigma / cost)
+        + jnp.diag(jnp.where(fixed, own, 0.0)),
+        q=linear / cost,
+        C=C_free / length[:, None],
         low=jnp.where(jnp.isfinite(low_hat), low_hat, 0.0),
         high=jnp.where(jnp.isfinite(high_hat), high_hat, 0.0),
         has_low=jnp.isfinite(low_hat) & ~equal & ~off,
@@ -95,33 +149,128 @@ def scale_rows(
         equal=equal,
     )
     return problem, RowScaling(
-        x=d * unit,
-        multipliers=unit * jnp.concatenate([row, 1.0 / d]),
+        x=d * sigma,
+        multipliers=cost / unit_of_row,
+        values=sigma * unit_of_row,
         at=at,
         fixed=fixed,
+        immovable=immovable,
     )
 
 
-def residuals(problem: RowProblem, x: Float[Array, "n"], y: Float[Array, "M"]) -> Float[Array, "3"]:
-    """Primal, dual and gap of a point and its multipliers, relative; see ``RowSolution``."""
-    value = problem.rows(x)
-    below = jnp.where(problem.has_low | problem.equal, problem.low - value, 0.0)
-    above = jnp.where(problem.has_high | problem.equal, value - problem.high, 0.0)
-    violation = jnp.maximum(jnp.max(below, initial=0.0), jnp.max(above, initial=0.0))
-    Hx, push = problem.H @ x, problem.adjoint(y)
-    largest = jnp.stack([jnp.max(jnp.abs(a)) for a in (Hx, problem.q, push)]).max()
-    # A multiplier at a side that does not exist is as wrong as its size.
-    low, high = problem.has_low, problem.has_high
-    wrong = jnp.where(problem.equal, 0.0, jnp.where(low, 0.0, jnp.maximum(-y, 0.0)))
-    wrong += jnp.where(problem.equal, 0.0, jnp.where(high, 0.0, jnp.maximum(y, 0.0)))
-    # The true complementarity: slacks of the rows as they are, not an iterate's own.
-    gap = jnp.sum(jnp.where(low, jnp.maximum(-y, 0.0) * jnp.abs(value - problem.low), 0.0))
-    gap += jnp.sum(jnp.where(high, jnp.maximum(y, 0.0) * jnp.abs(problem.high - value), 0.0))
-    size = jnp.abs(x @ Hx) + jnp.abs(problem.q @ x)
-    return jnp.stack(
-        [
-            violation / jnp.maximum(jnp.max(jnp.abs(value)), 1.0),
-            (jnp.max(jnp.abs(Hx + problem.q + push)) + jnp.max(wrong)) / jnp.maximum(largest, 1.0),
-            gap / jnp.maximum(size, 1.0),
-        ]
-    )
+def _expected_size(slope: Array, h: Array, low: Array, high: Array, off: Array, m: int) -> Array:
+    """Size of x, in units d: that of H^-1 q, unless bounds force another one."""
+    tiny = jnp.finfo(low.dtype).tiny
+    free_size = jnp.where(h > 0, slope / jnp.where(h > 0, h, 1.0), jnp.where(slope > 0, jnp.inf, 0))
+    sides = jnp.stack([low, high])
+    present = jnp.isfinite(sides) & ~off
+    largest = jnp.max(jnp.where(present, jnp.abs(sides), 0.0), initial=0.0)
+    # Bounds that keep x from 0.
+    least = jnp.max(jnp.where(off, 0.0, jnp.maximum(jnp.maximum(low, -high), 0.0)), initial=0.0)
+    size = jnp.where(largest > 0, jnp.minimum(free_size, largest), free_size)
+    size = jnp.maximum(size, least)
+    return jnp.where((size > tiny) & jnp.isfinite(size), size, 1.0)
+
+
+def kkt_errors(
+    H: Float[Array, "n n"],
+    q: Float[Array, "n"],
+    C: Float[Array, "m n"],
+    low: Float[Array, "M"],
+    high: Float[Array, "M"],
+    d: Float[Array, "n"],
+    units: Float[Array, "M"],
+    x: Float[Array, "n"],
+    y: Float[Array, "M"],
+) -> tuple[Float[Array, "3"], Float[Array, "M"], Float[Array, "M"]]:
+    """Primal, dual and gap of a point inside the box, relative, each by its own terms.
+
+    1. primal: of every row, violation / (|bound| + |C| |x|).
+    2. dual: of every variable, |H x + q + C^T y| / (|H| |x| + |q| + |C^T| |y|).
+    3. gap: (sum of |multiplier| slack, and of dual residual |x|) / (|x^T H x| + |q|^T |x|).
+
+    Component by component, so neither the size of the cost nor the unit of any variable or row
+    matters. What rounding of the largest terms leaves is none of these; ``d`` are the units that
+    make variables comparable for that, 0 for those that are fixed, and ``units`` those of rows and
+    box for x = d. A multiplier at a side that does not exist counts as 0, and what holds a variable
+    at its bound is the rest of its equation: the multipliers that come back are those judged; the
+    values (m + n,) of rows and box follow.
+    """
+    m, n = C.shape
+    rounding = 4.0 * n**0.5 * float(jnp.finfo(q.dtype).eps)
+    y = jnp.where(jnp.where(y > 0, high < jnp.inf, low > -jnp.inf), y, 0.0)
+    y_rows, y_box, size_x = y[:m], y[m:], jnp.abs(x)
+    # Sums of products, not products of matrices: the sum and that of its terms in one pass.
+    by_H, by_C, by_y = H * x, C * x, C * y_rows[:, None]
+    Hx, value, push = by_H.sum(1), by_C.sum(1), by_y.sum(0)
+    inverse = jnp.where(d > 0, 1.0 / jnp.where(d > 0, d, 1.0), 0.0)
+    reach = jnp.max(size_x * inverse)
+
+    noise = rounding * reach * units
+    violated = jnp.maximum(low[:m] - value, value - high[:m])
+    bound = jnp.where(violated > 0, jnp.where(low[:m] > value, low[:m], high[:m]), 0.0)
+    primal = _ratio(violated - noise[:m], jnp.abs(bound) + jnp.abs(by_C).sum(1))
+
+    rest = -(Hx + q + push)
+    holds = jnp.where(rest > 0, x >= high[m:], x <= low[m:])
+    y_box = jnp.where(holds, rest, y_box)
+    y = jnp.concatenate([y_rows, y_box])
+    r_dual = jnp.abs(y_box - rest)
+    rounded_terms = jnp.abs(by_H).sum(1) + jnp.abs(q)
+    y_terms = jnp.abs(by_y).sum(0) + jnp.abs(y_box)
+    hidden = rounding * jnp.maximum(rounded_terms, jnp.max(rounded_terms * d) * inverse)
+    dual = _ratio(r_dual - hidden - rounding * y_terms, rounded_terms + y_terms)
+
+    side = jnp.where(y > 0, high, low)
+    slack = jnp.where(y == 0, 0.0, jnp.abs(side - jnp.concatenate([value, x])))
+    whole = jnp.abs(q) @ size_x + jnp.abs(x @ Hx)
+    coarse = jnp.maximum(reach * ((jnp.abs(Hx) + jnp.abs(q)) @ d), whole)
+    y_size = jnp.abs(y)
+    open_terms = y_size @ jnp.maximum(slack - noise, 0.0)
+    open_terms += jnp.maximum(r_dual - hidden, 0.0) @ size_x
+    # Large multipliers that cancel one another must not hide what they leave in the cost; nor must
+    # a point so far out that rounding hides a slope that goes on for ever.
+    small = float(jnp.finfo(q.dtype).eps) ** 0.3
+    hidden_terms = y_size @ jnp.minimum(slack, noise)
+    hidden_terms += small * (jnp.minimum(r_dual, hidden) @ size_x)
+    gap = _ratio(open_terms, whole) + _ratio(hidden_terms, coarse)
+    error = jnp.stack([jnp.max(primal, initial=0.0), jnp.max(dual), gap])
+    return error, y, jnp.concatenate([value, x])
+
+
+def contradicts(
+    scaling: RowScaling, C: Float[Array, "m n"], low: Array, high: Array, tolerance: float
+) -> Bool[Array, ""]:
+    """Whether a row that no free variable can move breaks its bound."""
+    m = C.shape[0]
+    low, high, value = low[:m], high[:m], C @ scaling.at
+    over = jnp.maximum(low - value, value - high)
+    bound = jnp.where(over > 0, jnp.where(low > value, low, high), 0.0)
+    terms = jnp.abs(bound) + jnp.abs(C) @ jnp.abs(scaling.at)
+    return (scaling.immovable & (_ratio(over, terms) > tolerance)).any()
+
+
+def rows_error(
+    C: Float[Array, "m n"],
+    low: Float[Array, "m"],
+    high: Float[Array, "m"],
+    d: Float[Array, "n"],
+    x: Float[Array, "n"],
+) -> Float[Array, ""]:
+    """The primal part of ``kkt_errors``, of the rows alone."""
+    n = x.shape[0]
+    rounding = 4.0 * n**0.5 * float(jnp.finfo(x.dtype).eps)
+    size_C, value = jnp.abs(C), C @ x
+    violated = jnp.maximum(low - value, value - high)
+    noise = rounding * jnp.max(jnp.abs(x) / d) * (size_C @ d)
+    bound = jnp.where(violated > 0, jnp.where(low > value, low, high), 0.0)
+    return jnp.max(_ratio(violated - noise, jnp.abs(bound) + size_C @ jnp.abs(x)), initial=0.0)
+
+
+def _ratio(part: Array, whole: Array) -> Array:
+    """Non-negative part / whole; 0 where there is no part, infinite where there is no whole.
+
+    NaN stays NaN.
+    """
+    ratio = jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), jnp.inf)
+    return jnp.where(part <= 0, 0.0, jnp.where(jnp.isnan(part), jnp.nan, ratio))

@@ -14,7 +14,7 @@ last index) ends after finitely many, since H is positive definite.
 Everything here is in the Jacobi-scaled coordinates of ``qp.problem``, in which x and g compare.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -50,7 +50,7 @@ def pivot(
     lower: Float[Array, "n"],
     upper: Float[Array, "n"],
     *,
-    threshold: Float[Array, ""],
+    threshold: tuple[Array, Array],
     limit: int | Int[Array, ""],
 ) -> Pivoted:
     """Exchange variables until none is further off than ``threshold``, or ``limit`` is reached.
@@ -61,61 +61,67 @@ def pivot(
       q: linear term.
       lower: bounds; equal ones fix their variable.
       upper: bounds.
-      threshold: of a bound's violation or a gradient's wrong sign.
+      threshold: of a bound's violation, and of a gradient's wrong sign; () or (n,) each.
       limit: of the exchanges.
     """
     zero = jnp.zeros((), jnp.int32)
-    state = _State(table, side, q, at=zero, more=jnp.ones((), bool), exchanges=zero)
-    problem = (q, lower, upper, threshold, jnp.asarray(limit, jnp.int32))
-    state = while_any(lambda state: state.more, _exchange, _look(state, *problem), *problem)
+    state = _State(table, side, q, pivot=zero, pending=jnp.ones((), bool), exchanges=zero)
+    tiny = float(jnp.finfo(q.dtype).tiny)
+    weights = tuple(1.0 / jnp.maximum(part, tiny) for part in threshold)
+    problem: tuple[Any, ...] = (q, lower, upper, weights, jnp.asarray(limit, jnp.int32))
+    state = while_any(lambda state: state.pending, _exchange, _choose(state, *problem), *problem)
     return Pivoted(table=state.table, side=state.side, y=state.y, exchanges=state.exchanges)
 
 
 class _State(NamedTuple):
-    """``at`` is the variable to exchange next, if there is ``more`` to do."""
+    """``pivot`` is the variable to exchange next, if one is ``pending``."""
 
     table: Array
     side: Array
     y: Array
-    at: Array
-    more: Array
+    pivot: Array
+    pending: Array
     exchanges: Array
 
 
-def _look(
-    state: _State, q: Array, lower: Array, upper: Array, threshold: Array, limit: Array
+def _choose(
+    state: _State, q: Array, lower: Array, upper: Array, weight: Any, limit: Array
 ) -> _State:
-    """Which variable is furthest off its conditions."""
+    """Which variable violates its conditions most."""
     n, dtype = q.shape[0], q.dtype
-    free, fixed = state.side == 0, lower >= upper
-    y = state.table @ jnp.where(free, -q, jnp.where(state.side < 0, lower, upper))
-    off = jnp.where(
-        free, jnp.maximum(lower - y, y - upper), jnp.sign(state.side).astype(dtype) * (y + q)
+    side = state.side
+    free, fixed = side == 0, lower >= upper
+    y = state.table @ jnp.where(free, -q, jnp.where(side < 0, lower, upper))
+    violation = jnp.where(
+        free, jnp.maximum(lower - y, y - upper), jnp.sign(side).astype(dtype) * (y + q)
     )
-    off = jnp.where(fixed, jnp.where(free, jnp.inf, -jnp.inf), off)
+    violation = violation * jnp.where(free, weight[0], weight[1])
+    violation = jnp.where(fixed, jnp.where(free, jnp.inf, -jnp.inf), violation)
     # Murty's rule as a priority: above every violation, and higher for higher indices.
     by_index = jnp.finfo(dtype).max * (jnp.arange(n) + 1).astype(dtype) / (2 * n)
-    off = jnp.where((state.exchanges > 3 * n) & (off > threshold), by_index, off)
-    at = jnp.argmax(off).astype(jnp.int32)
-    more = state.more & (off[at] > threshold) & (state.exchanges < limit)
-    return state._replace(y=y, at=at, more=more)
+    violation = jnp.where((state.exchanges > 3 * n) & (violation > 1.0), by_index, violation)
+    pivot = jnp.argmax(violation).astype(jnp.int32)
+    pending = state.pending & (violation[pivot] > 1.0) & (state.exchanges < limit)
+    return state._replace(y=y, pivot=pivot, pending=pending)
 
 
 def _exchange(
-    state: _State, q: Array, lower: Array, upper: Array, threshold: Array, limit: Array
+    state: _State, q: Array, lower: Array, upper: Array, weight: Any, limit: Array
 ) -> _State:
-    """The state after the exchange of ``at``; the same one if there is none to do."""
-    table, side, y, at, more, count = state
+    """The state after the exchange of the pivot; the same one if none is pending."""
+    table, side, y, pivot, pending, count = state
     n, dtype = q.shape[0], q.dtype
-    here = (jnp.arange(n, dtype=jnp.int32) == at) & more
-    unit = here.astype(dtype)
+    is_pivot = (jnp.arange(n, dtype=jnp.int32) == pivot) & pending
+    unit = is_pivot.astype(dtype)
     sign = jnp.where(side == 0, 1.0, -1.0).astype(dtype)
-    row = unit @ table  # a product, not table[at]: XLA would index inside the update's inner loop
+    row = (
+        unit @ table
+    )  # a product, not table[pivot]: XLA would index inside the update's inner loop
     # The tableau is symmetric but for the signs between free and bound variables.
-    column = row * (sign * sign[at])
-    divisor = jnp.where(more, 1.0 / jnp.where(more, row[at], 1.0), 0.0)
+    column = row * (sign * sign[pivot])
+    divisor = jnp.where(pending, 1.0 / jnp.where(pending, row[pivot], 1.0), 0.0)
     table = table - ((column + unit) * divisor)[:, None] * (row - unit)[None, :]
-    there = jnp.where((y < lower) | (lower >= upper), -1, 1).astype(side.dtype)
-    side = jnp.where(here, jnp.where(side == 0, there, 0), side)
-    moved = state._replace(table=table, side=side, exchanges=count + more)
-    return _look(moved, q, lower, upper, threshold, limit)
+    new_status = jnp.where((y < lower) | (lower >= upper), -1, 1).astype(side.dtype)
+    side = jnp.where(is_pivot, jnp.where(side == 0, new_status, 0), side)
+    moved = state._replace(table=table, side=side, exchanges=count + pending)
+    return _choose(moved, q, lower, upper, weight, limit)

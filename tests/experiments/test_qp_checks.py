@@ -73,3 +73,38 @@ def test_public_problems_are_solved_to_1e_9(checks, monkeypatch):
     monkeypatch.setattr(checks, "_median_us", lambda call: 1.0)  # no speed in tests
     found = checks.public_problems(PUBLIC, {})
     assert (found["problems"], found["solved_1e9"]) == (30, 30)
+
+
+@pytest.fixture(scope="module")
+def random_rows(checks):
+    return importlib.import_module("qp_random_rows")
+
+
+def test_no_random_problem_with_rows_has_a_wrong_answer(random_rows, monkeypatch):
+    monkeypatch.setattr(random_rows, "BATCH", 64)
+    kinds = ("known", "infeasible", "unbounded", "linear")
+    methods = ("auto", "active_set", "admm")
+    found = random_rows.count(1, methods=methods, shapes=((4, 6),), kinds=kinds)
+    assert random_rows.wrong(found) == 0
+    for kind in kinds:
+        entry = found[f"auto, {kind}"]
+        assert entry["problems"] == 64
+        assert entry["proven"] >= 60  # it does not merely refuse
+
+
+def test_linear_programs_drawn_from_a_known_point_have_the_cost_that_highs_finds(random_rows):
+    problems = random_rows.draw(np.random.default_rng(3), "linear", 20, 5, 8)
+    for i in range(20):
+        best = random_rows.linear_program_cost(tuple(part[i] for part in problems.data))
+        np.testing.assert_allclose(best, problems.least[i], rtol=0, atol=1e-6 * problems.terms[i])
+
+
+def test_a_lie_about_rows_is_found_out(random_rows, monkeypatch):
+    monkeypatch.setattr(random_rows, "BATCH", 64)
+
+    def lie(H, q, C, row_lower, row_upper, lower, upper, **options):
+        return Namespace(x=jnp.clip(-q, lower, upper), status=jnp.asarray(qp.Status.SOLVED))
+
+    monkeypatch.setattr(random_rows.qp, "solve_rows", lie)
+    found = random_rows.count(1, methods=("auto",), shapes=((4, 6),), kinds=("known", "infeasible"))
+    assert random_rows.wrong(found) > 0.9 * 128

@@ -1,5 +1,6 @@
 """Tables and plans: the closed-form regulator, bounds, swing ends, contact points."""
 
+import dataclasses
 from functools import partial
 
 import chex
@@ -432,3 +433,30 @@ def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():
         u = np.tile(R.T @ world, 2)
         # Each end's row is 0.1 N over.
         np.testing.assert_allclose((rows.A @ u).reshape(2, 2).max(axis=1), 0.1, atol=1e-9)
+
+
+def test_with_rows_the_warm_start_is_carried_and_admm_plans_the_same(bounded, start):
+    x, reference = start
+    mode = jnp.asarray(int(Mode.TROT), jnp.int32)
+    posture = LegTrig(*(jnp.full((4,), f(a)) for a in (0.9, -0.9) for f in (np.sin, np.cos)))
+    stance = jnp.array([True, False, False, True])
+    rows = force_limits(
+        go1.PARAMS, posture, jnp.eye(2), stance, friction=0.05, torque_fraction=0.95
+    )
+    z = lift(x)
+    carried = lmpc.start_memory(bounded, BOUNDED, carry=True)
+    first = solve(bounded, mode, z, reference, carried, config=BOUNDED, rows=rows)
+    assert first.warm is not None
+    again = lmpc.LmpcMemory(plan=first.plan, mode=mode, warm=first.warm)
+    second = solve(bounded, mode, z, reference, again, config=BOUNDED, rows=rows)
+    assert second.iterations <= first.iterations  # the box's part of them is 0 now
+    box = solve(bounded, mode, z, reference, again, config=BOUNDED)
+    assert box.iterations == 0
+    np.testing.assert_allclose(second.plan, first.plan, rtol=0, atol=1e-8)
+    config = dataclasses.replace(BOUNDED, solver="admm")
+    admm = solve(bounded, mode, z, reference, memory(), config=config, rows=rows)
+    assert admm.status == first.status == Status.SOLVED
+    forces = np.asarray(first.plan).reshape(4, 4)
+    assert (np.abs(forces[:, ::2]) <= 0.05 * forces[:, 1::2] + 1e-6).all()
+    # Tolerance 1e-9 times the condition of 1e5 times forces of 1e2 N.
+    np.testing.assert_allclose(admm.plan, first.plan, rtol=0, atol=1e-2)

@@ -115,10 +115,10 @@ def test_the_residual_of_a_free_problem_is_the_relative_gradient(random_qp):
     unbounded = np.full(12, np.inf)
     d = np.diag(H) ** -0.5
     gradient = d * (H @ x + q)
-    size = max(np.abs(d * q).max(), np.abs(x / d).max())
+    own = d * np.maximum(np.abs(H) @ np.abs(x), np.abs(q))
     ours = kkt_residual(*map(jnp.asarray, (H, q, -unbounded, unbounded, x)))
-    # A few roundings.
-    np.testing.assert_allclose(ours, np.abs(gradient).max() / size, rtol=1e-12)
+    # A few roundings, and what the judge leaves for rounding.
+    np.testing.assert_allclose(ours, (np.abs(gradient) / own).max(), rtol=1e-11)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

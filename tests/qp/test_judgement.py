@@ -1,0 +1,246 @@
+"""Nothing is called solved that is not: immovable rows, all scales, linear and unbounded programs.
+
+The judges are HiGHS, known KKT points, and plain numpy.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from kjax import qp
+from kjax.qp import MethodUsed, Status
+
+INF = np.inf
+solve = jax.jit(qp.solve_rows, static_argnames=("method", "tolerance", "max_iterations"))
+
+
+@pytest.fixture(params=qp.ROW_METHODS)
+def method(request):
+    return request.param
+
+
+@pytest.fixture(params=["auto", "interior_point", "admm"])
+def semidefinite_method(request):
+    return request.param
+
+
+IMMOVABLE = {
+    "a zero row 0 >= 1": ([[0.0, 0.0]] * 2, [1.0, 0.0], [INF, 0.0], [-1.0, -1.0], [1.0, 1.0]),
+    "x1 + x2 >= 5, both fixed at 0": (
+        [[1.0, 1.0], [0.0, 0.0]], [5.0, 0.0], [INF, 0.0], [0.0, 0.0], [0.0, 0.0],
+    ),
+    "friction of a swing foot held at 9": (
+        [[1.0, -0.6], [-1.0, -0.6]], [-INF] * 2, [0.0] * 2, [9.0, 0.0], [9.0, 0.0],
+    ),
+    "beside a row that moves": (
+        [[1.0, 1.0], [0.0, 1.0]], [-9.0, 2.0], [9.0, 3.0], [-1.0, 1.0], [1.0, 1.0],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", IMMOVABLE)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_row_that_nothing_can_move_is_infeasible_where_it_breaks_its_bound(case, method, dtype):
+    data = [np.asarray(a, dtype) for a in IMMOVABLE[case]]
+    solution = solve(np.eye(2, dtype=dtype), np.ones(2, dtype), *data, method=method)
+    assert solution.status == Status.INFEASIBLE
+    assert solution.primal > 0.1
+    assert jnp.isfinite(solution.x).all()
+
+
+def test_a_row_that_nothing_can_move_has_no_effect_where_it_holds(method):
+    C = np.array([[0.0, 0.0], [0.0, 1.0]])
+    low, high = np.array([-1.0, 0.25]), np.array([0.0, 0.25])
+    lower, upper = np.array([-1.0, 0.25]), np.array([1.0, 0.25])
+    solution = solve(np.eye(2), np.array([3.0, 0.0]), C, low, high, lower, upper, method=method)
+    assert solution.status == Status.SOLVED
+    np.testing.assert_allclose(solution.x, [-1.0, 0.25], rtol=0, atol=1e-12)
+
+
+def linear_program(seed, n=6, m=8):
+    rng = np.random.default_rng(seed)
+    C, q = rng.normal(size=(m, n)), rng.normal(size=n)
+    middle = C @ rng.uniform(-1, 1, n)
+    return q, C, middle - rng.uniform(0, 2, m), middle + rng.uniform(0, 2, m), -5.0, 5.0
+
+
+def highs(q, C, low, high, lower, upper):
+    found = linprog(
+        q, A_ub=np.vstack([C, -C]), b_ub=np.r_[high, -low], bounds=[(lower, upper)] * len(q)
+    )
+    assert found.status == 0
+    return found.fun
+
+
+def assert_feasible(C, low, high, lower, upper, x, tolerance=1.1e-9):
+    value, terms = C @ x, np.abs(C) @ np.abs(x)
+    assert (value - high <= tolerance * (np.abs(high) + terms)).all()
+    assert (low - value <= tolerance * (np.abs(low) + terms)).all()
+    assert ((lower <= x) & (x <= upper)).all()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_linear_programs_are_solved(seed, semidefinite_method):
+    q, C, low, high, lower, upper = linear_program(seed)
+    n = len(q)
+    box = np.full(n, lower), np.full(n, upper)
+    solution = solve(np.zeros((n, n)), q, C, low, high, *box, method=semidefinite_method)
+    assert solution.status == Status.SOLVED
+    x = np.asarray(solution.x)
+    assert_feasible(C, low, high, lower, upper, x)
+    best = highs(q, C, low, high, lower, upper)
+    np.testing.assert_allclose(q @ x, best, rtol=0, atol=1e-8 * np.abs(q) @ np.abs(x))
+
+
+@pytest.mark.parametrize("exponent", [-14, -12, -10, -9, -7, -3, 3, 7, 14])
+def test_whatever_the_size_of_h_beside_q_and_the_box(exponent, method):
+    """With a small H the problem is a linear program but for that, and HiGHS knows its cost."""
+    for seed in range(4):
+        q, C, low, high, lower, upper = linear_program(seed)
+        n = len(q)
+        rng = np.random.default_rng(seed)
+        factor = rng.normal(size=(n, n))
+        H = 10.0**exponent * (factor @ factor.T + np.eye(n))
+        box = np.full(n, lower), np.full(n, upper)
+        solution = solve(H, q, C, low, high, *box, method=method)
+        assert solution.status == Status.SOLVED
+        x = np.asarray(solution.x)
+        assert_feasible(C, low, high, lower, upper, x)
+        # Lower bound of the cost: the multipliers', H positive definite.
+        y = np.asarray(solution.multipliers)
+        sides = np.where(y > 0, np.r_[high, box[1]], np.r_[low, box[0]])
+        slope = q + C.T @ y[: len(C)] + y[len(C) :]
+        bound = -0.5 * slope @ np.linalg.solve(H, slope) - y @ sides
+        cost = 0.5 * x @ H @ x + q @ x
+        assert cost - bound <= 1e-7 * (x @ H @ x + np.abs(q) @ np.abs(x))
+        if exponent <= -9:
+            best = highs(q, C, low, high, lower, upper)
+            np.testing.assert_allclose(q @ x, best, rtol=1e-6)
+
+
+@pytest.mark.parametrize("exponent", [-14, -10, -7, 7, 14])
+@pytest.mark.parametrize("method", qp.METHODS)
+def test_a_box_is_solved_whatever_the_size_of_h(exponent, method):
+    box = jax.jit(
+        lambda H, q, lower, upper: qp.solve(qp.prepare(H), q, lower, upper, method=method)
+    )
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        factor = rng.normal(size=(5, 5))
+        H = 10.0**exponent * (factor @ factor.T + np.eye(5))
+        q = rng.normal(size=5) * 10.0 ** rng.uniform(-8, 0, 5)
+        solution = box(H, q, np.full(5, -5.0), np.full(5, 5.0))
+        assert solution.status == Status.SOLVED
+        x = np.asarray(solution.x)
+        gradient = H @ x + q
+        held = ((x == -5.0) & (gradient > 0)) | ((x == 5.0) & (gradient < 0))
+        terms = np.abs(H) @ np.abs(x) + np.abs(q)
+        assert (np.abs(gradient[~held]) <= 1e-9 * terms[~held] + 1e-14 * np.abs(q).max()).all()
+
+
+UNBOUNDED = {
+    "no box": (np.zeros((2, 2)), [1.0, 1.0], np.full(2, -INF), np.full(2, INF)),
+    "open to one side": (np.zeros((2, 2)), [1.0, 1.0], np.full(2, -INF), np.zeros(2)),
+    "along what H does not see": (
+        np.array([[1.0, -1.0], [-1.0, 1.0]]), [1.0, 1.0], np.full(2, -INF), np.full(2, INF),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", UNBOUNDED)
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_an_unbounded_cost_has_its_status_a_finite_point_and_no_derivative(
+    case, scale, semidefinite_method
+):
+    H, q, lower, upper = UNBOUNDED[case]
+    C = np.array([[1.0, -1.0]])
+    row = np.array([-1.0]), np.array([1.0])
+    data = (H, scale * np.array(q), C, *row, lower, upper)
+    solution = solve(*data, method=semidefinite_method)
+    assert solution.status == Status.UNBOUNDED
+    assert jnp.isfinite(solution.x).all()
+    assert_feasible(C, *row, lower, upper, np.asarray(solution.x))
+    slope = jax.grad(lambda q: solve(data[0], q, *data[2:], method=semidefinite_method).x.sum())
+    np.testing.assert_array_equal(slope(data[1]), 0.0)
+
+
+def test_the_same_problem_with_a_floor_is_solved(semidefinite_method):
+    data = (np.zeros((2, 2)), np.ones(2), np.array([[1.0, -1.0]]), np.array([-1.0]), np.ones(1))
+    solution = solve(*data, np.array([-2.0, -INF]), np.full(2, INF), method=semidefinite_method)
+    assert solution.status == Status.SOLVED
+    np.testing.assert_allclose(solution.x, [-2.0, -3.0], rtol=0, atol=1e-8)
+
+
+def test_auto_says_which_method_it_took_for_each_member_of_a_batch():
+    q, C, low, high, lower, upper = linear_program(0)
+    n = len(q)
+    H = np.stack([np.eye(n), np.zeros((n, n)), np.diag([1.0] * (n - 1) + [0.0])])
+    box = np.full(n, lower), np.full(n, upper)
+    batch = jax.vmap(lambda H: solve(H, q, C, low, high, *box))(H)
+    assert (batch.status == Status.SOLVED).all()
+    wanted = [MethodUsed.ACTIVE_SET, MethodUsed.INTERIOR_POINT, MethodUsed.INTERIOR_POINT]
+    np.testing.assert_array_equal(batch.method, wanted)
+
+
+def test_neither_units_nor_the_size_of_the_cost_change_the_verdict(method):
+    rng = np.random.default_rng(0)
+    q, C, low, high, lower, upper = linear_program(1)
+    n = len(q)
+    factor = rng.normal(size=(n, n))
+    H = factor @ factor.T + 0.1 * np.eye(n)
+    box = np.full(n, lower), np.full(n, upper)
+    plain = solve(H, q, C, low, high, *box, method=method)
+    unit, row, cost = 2.0 ** rng.integers(-8, 9, n), 2.0 ** rng.integers(-8, 9, len(C)), 2.0**20
+    other = solve(
+        cost * H * unit[:, None] * unit,
+        cost * q * unit,
+        C * unit * row[:, None],
+        low * row,
+        high * row,
+        *(b / unit for b in box),
+        method=method,
+    )
+    assert plain.status == other.status == Status.SOLVED
+    np.testing.assert_allclose(other.x * unit, plain.x, rtol=0, atol=1e-7)
+
+
+def test_admm_starts_from_a_point():
+    q, C, low, high, lower, upper = linear_program(2)
+    n = len(q)
+    data = (np.eye(n), q, C, low, high, np.full(n, lower), np.full(n, upper))
+    cold = solve(*data, method="admm")
+    warm = solve(*data, cold.x, method="admm")
+    assert warm.status == cold.status == Status.SOLVED
+    assert warm.iterations <= cold.iterations
+    np.testing.assert_allclose(warm.x, cold.x, rtol=0, atol=1e-8)
+    useless = solve(*data, np.full(n, np.nan), method="admm")
+    assert useless.status == Status.SOLVED
+
+
+def test_a_useless_tolerance_of_rows_is_none_in_float32(method):
+    q, C, low, high, lower, upper = (np.asarray(a, np.float32) for a in linear_program(3))
+    n = len(q)
+    solve32 = partial(solve, method=method)
+    box = np.full(n, lower), np.full(n, upper)
+    solution = solve32(np.eye(n, dtype=np.float32), q, C, low, high, *box)
+    assert solution.status == Status.SOLVED
+    assert_feasible(C, low, high, lower, upper, np.asarray(solution.x), tolerance=1e-5)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_at_the_tip_of_all_friction_cones_the_answer_is_no_force(dtype, method):
+    """Every term of every row vanishes there: what rounding leaves of 0 must not be judged."""
+    n = 6
+    C = np.kron(np.eye(n // 2), [[1.0, -0.6], [-1.0, -0.6]]).astype(dtype)
+    q = np.tile([3.0, 40.0], n // 2).astype(dtype)
+    factor = np.random.default_rng(0).normal(size=(n, n))
+    H = (factor @ factor.T + np.eye(n)).astype(dtype)
+    rows = np.full(n, -INF, dtype), np.zeros(n, dtype)
+    box = np.tile([-60.0, 0.0], n // 2).astype(dtype), np.tile([60.0, 160.0], n // 2).astype(dtype)
+    solution = solve(H, q, C, *rows, *box, method=method)
+    assert solution.status == Status.SOLVED
+    np.testing.assert_allclose(solution.x, 0.0, atol=1e-4 if dtype == "float32" else 1e-10)
