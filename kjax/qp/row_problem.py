@@ -190,10 +190,10 @@ def kkt_errors(
     3. gap: (sum of |multiplier| slack, and of dual residual |x|) / (|x^T H x| + |q|^T |x|).
 
     Component by component, so neither the size of the cost nor the unit of any variable or row
-    matters. What rounding of the largest terms leaves is none of these; ``d`` are the units that
-    make variables comparable for that, 0 for those that are fixed, and ``units`` those of rows and
-    box for x = d. A multiplier at a side that does not exist counts as 0, and what holds a variable
-    at its bound is the rest of its equation: the multipliers that come back are those judged; the
+    matters. What rounding of the largest terms leaves is none of these. For that, ``d`` are the
+    expected sizes of the variables, 0 for those that are fixed, and ``units`` those of rows and box
+    for x = d. A multiplier at a side that does not exist counts as 0, and what holds a variable at
+    its bound is the rest of its equation: the multipliers that come back are those judged; the
     values (m + n,) of rows and box follow.
     """
     m, n = C.shape
@@ -223,8 +223,11 @@ def kkt_errors(
 
     side = jnp.where(y > 0, high, low)
     slack = jnp.where(y == 0, 0.0, jnp.abs(side - jnp.concatenate([value, x])))
-    whole = jnp.abs(q) @ size_x + jnp.abs(x @ Hx)
-    coarse = jnp.maximum(reach * ((jnp.abs(Hx) + jnp.abs(q)) @ d), whole)
+    # At a solution H x is -(q + C^T y); far out it may be rounding, which is no measure.
+    balance = jnp.abs(q) + y_terms
+    whole = jnp.abs(q) @ size_x + jnp.minimum(jnp.abs(x @ Hx), balance @ size_x)
+    coarse = jnp.abs(q) + jnp.minimum(jnp.abs(Hx), balance)
+    coarse = jnp.maximum(reach * (coarse @ d), whole)
     y_size = jnp.abs(y)
     open_terms = y_size @ jnp.maximum(slack - noise, 0.0)
     open_terms += jnp.maximum(r_dual - hidden, 0.0) @ size_x
@@ -234,6 +237,9 @@ def kkt_errors(
     hidden_terms = y_size @ jnp.minimum(slack, noise)
     hidden_terms += small * (jnp.minimum(r_dual, hidden) @ size_x)
     gap = _ratio(open_terms, whole) + _ratio(hidden_terms, coarse)
+    eps = float(jnp.finfo(q.dtype).eps)
+    drowned = rounding * jnp.max(rounded_terms * d) > jnp.max(balance * d)
+    gap = jnp.where(drowned & (reach > eps**-0.5), jnp.inf, gap)
     error = jnp.stack([jnp.max(primal, initial=0.0), jnp.max(dual), gap])
     return error, y, jnp.concatenate([value, x])
 

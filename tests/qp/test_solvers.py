@@ -41,7 +41,7 @@ def independent_residual(H, q, lower, upper, x):
     """Relative KKT residual in numpy: a gradient that no bound holds, against its own terms."""
     H, q, lower, upper, x = (np.asarray(a, np.float64) for a in (H, q, lower, upper, x))
     d = np.diag(H) ** -0.5
-    gradient, own = d * (H @ x + q), d * np.maximum(np.abs(H) @ np.abs(x), np.abs(q))
+    gradient, own = d * (H @ x + q), np.maximum(np.abs(x / d), np.abs(d * q))
     held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     rounding = 4 * np.sqrt(len(q)) * np.finfo(float).eps
     noise = rounding * max(np.abs(d * q).max(), np.abs(x / d).max())
