@@ -202,6 +202,9 @@ def build_simulation(config: RunConfig) -> Simulation:
     sensed = np.zeros(example.shape)
     state = simulation.init(sensed)
     jax.block_until_ready((simulation.plan(state, sensed), simulation.act(state, sensed)))
+    # The noise's program as well: a Ctrl-C during a compilation can take the process down.
+    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    sensor_noise(config, _NOISE_TICKS * per_tick)
     return simulation
 
 
