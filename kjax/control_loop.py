@@ -11,9 +11,10 @@ from math import inf
 import jax
 import numpy as np
 
-from kjax.controller import Controller, ControllerState, PlanInfo
+from kjax.controller import Controller
 from kjax.observation import check_shapes
 from kjax.params import ControllerParams
+from kjax.state import ControllerState, PlanInfo
 from kjax.types import Observation
 
 PERIOD_TOLERANCE = 0.2  # relative error of the mean period that is told

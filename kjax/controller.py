@@ -11,14 +11,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from kjax import gait, qp
 from kjax.config import RunConfig
-from kjax.legs import lateral, swing
+from kjax.legs import contact, lateral, swing
 from kjax.legs.base import Footing, LegCommand, View, build_base
 from kjax.legs.kinematics import PlanarState
-from kjax.mpc.lmpc import LmpcMemory, start_memory
+from kjax.mpc.lmpc import start_memory
 from kjax.observation import (
     MAX_JOINT_RATE,
     cast,
@@ -28,85 +28,10 @@ from kjax.observation import (
     or_neutral,
 )
 from kjax.params import ControllerParams
-from kjax.planning import ForceTask, Planner, build_planner, periodic_motion
+from kjax.planning import ForceTask, Planner, build_planner
+from kjax.reference import next_clock, next_reference
+from kjax.state import ControllerState, PlanInfo
 from kjax.types import Observation
-
-
-class ControllerState(NamedTuple):
-    """What the controller remembers between calls; nothing in it depends on where zero is.
-
-    Points are in the *local* frame: origin at the trunk's, axes of the world (planar base) or of
-    the track frame of ``legs.spatial`` (free base). They are carried along by the trunk's velocity,
-    so that no position estimate enters.
-
-    Attributes:
-      time: since ``init`` [s].
-      clock: place in the gait.
-      stance: (4,) scheduled stance legs.
-      lag: reference of p_x less p_x, the integral of the velocity's error, bounded [m].
-      velocity_command: velocity commanded now [m/s].
-      ground: height of the ground under the last stance feet, local frame [m].
-      velocity: reference of v_x, which follows the command at a bounded rate [m/s].
-      correction: integrals of the errors of velocity and pitch, added to their references
-        [m/s, rad].
-      memory: of the LMPC within a stance: its last plan and where the QP goes on from.
-      force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
-      swing: state of the swing legs, local frame.
-      feet: (4, d) foot centres in the last valid sample, local frame [m].
-      base_vel: (d,) velocity of the trunk in that sample, local axes [m/s].
-      torque: (4, 3) last torque of a valid sample [N m].
-      blind_time: time without a valid sample [s].
-      contact_time: (4,) how long each contact flag has been on without a break [s].
-      contradiction: (4,) share of the last 0.1 s or so in which a leg's flag said what its
-        kinematics deny [-].
-      track: (2,) cosine and sine of the heading to keep, the trunk's at ``init``, world [-];
-        ``None`` on the planar base.
-    """
-
-    time: Float[Array, ""]
-    clock: gait.Clock
-    stance: Bool[Array, "4"]
-    lag: Float[Array, ""]
-    velocity_command: Float[Array, ""]
-    ground: Float[Array, ""]
-    velocity: Float[Array, ""]
-    correction: Float[Array, "2"]
-    memory: LmpcMemory
-    force: Float[Array, "4 2"]
-    swing: swing.SwingState
-    feet: Float[Array, "4 d"]
-    base_vel: Float[Array, "d"]
-    torque: Float[Array, "4 3"]
-    blind_time: Float[Array, ""]
-    contact_time: Float[Array, "4"]
-    contradiction: Float[Array, "4"]
-    track: Float[Array, "2"] | None
-
-
-class PlanInfo(NamedTuple):
-    """What a plan did; for logs and for callers that must know.
-
-    Attributes:
-      status: a ``qp.Status``. At the iteration limit the solver's last point is in force; with
-        faulty data the shifted last plan is.
-      residual: relative KKT residual of the solver's point [-].
-      iterations: of the solver.
-      mode: contact mode.
-      x: (6,) SRB state as estimated from the observation; p_x and p_z from the ground below the
-        centre of mass [m, rad, m/s, rad/s].
-      reference: (6,) state wanted one model step ahead, likewise.
-      contact_fault: (4,) legs whose contact flag keeps contradicting their kinematics.
-      blind_time: time without a valid sample, this one included [s].
-    """
-
-    status: Int[Array, ""]
-    residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-    mode: Int[Array, ""]
-    x: Float[Array, "6"]
-    reference: Float[Array, "6"]
-    contact_fault: Bool[Array, "4"]
-    blind_time: Float[Array, ""]
 
 
 class Controller(NamedTuple):
@@ -146,10 +71,6 @@ class Controller(NamedTuple):
     ]
     control_dt: float
     act_dt: float
-
-
-FAULT_TIME = 0.5  # s, over which a contact flag's contradictions are averaged
-FAULT_SHARE = 0.04  # of the samples; a swing that grazes a block contradicts for a few ms
 
 
 def build_controller(config: RunConfig, planner: Planner | None = None) -> Controller:
@@ -197,8 +118,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
             base_vel=view.base_vel,
             torque=jnp.zeros((4, 3), zero.dtype),
             blind_time=zero,
-            contact_time=jnp.zeros((4,), zero.dtype),
-            contradiction=jnp.zeros((4,), zero.dtype),
+            contact=contact.initial_contact(zero.dtype),
             track=track,
         )
         # A buffer of its own for every leaf, so that the state may be donated.
@@ -220,17 +140,17 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
         params: ControllerParams,
         state: ControllerState,
         view: View,
-        contact: Array,
+        flags: Array,
         valid: Array,
     ) -> tuple[ControllerState, PlanInfo]:
         clock = next_clock(params, state, control_dt)
         where = (clock.gait, clock.phase)
         stance, mode = params.schedule.stance[where], params.schedule.mode[where]
         feet = jnp.where(valid, view.feet, state.feet)
-        swings = _next_swings(params, state, clock, stance, contact, feet)
+        swings = _next_swings(params, state, clock, stance, flags, feet)
         heights = feet[:, -1] - params.robot.foot_radius
         ground = _mean_height(heights, stance, state.ground)
-        wanted = _next_reference(params, state, clock, view.planar, control_dt)
+        wanted = next_reference(params, state, clock, view.planar, control_dt)
         solved = plan_forces(
             params,
             ForceTask(
@@ -268,7 +188,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
             mode=mode,
             x=_above_ground(view.planar, ground).x,
             reference=solved.reference,
-            contact_fault=state.contradiction > FAULT_SHARE,
+            contact_fault=contact.is_faulty(state.contact),
             blind_time=jnp.where(valid, 0.0, state.blind_time + act_dt),
         )
         return next_state, info
@@ -297,37 +217,31 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
         foot, foot_vel = swing.foot_path(settings, swings, target)
 
         # Step 2: what they have hit meanwhile.
-        contact = observation.contact & valid
-        contact_time = jnp.where(contact, state.contact_time + act_dt, 0.0)
-        blocked, denied = swing.believable_contact(
-            contact_time,
-            swings.elapsed,
-            (view.feet, view.feet_vel),
-            (foot, foot_vel),
+        flags = contact.read_flags(
+            state.contact,
+            observation.contact & valid,
+            contact.LegPhase(state.stance, state.clock.elapsed, swings.elapsed),
+            contact.FootMotion(view.feet, view.feet_vel),
+            contact.FootMotion(foot, foot_vel),
             state.ground + robot.foot_radius,
+            act_dt,
         )
-        flicker = ~contact & (state.contact_time > 0) & (state.contact_time < FLICKER)
-        swings = swing.hold_feet(
-            settings, swings, ~state.stance, blocked & valid, contact, flicker, view.feet, act_dt
-        )
+        flags = flags._replace(flicker=flags.flicker & valid)
+        swings = swing.hold_feet(settings, swings, flags, view.feet, act_dt)
         foot, foot_vel = swing.held_or_on_path(settings, swings, foot, foot_vel)
 
         # Step 3: torques, those of the last valid sample for a while, then damping.
         command = LegCommand(state.stance & ~swings.reaching, state.force, foot, foot_vel)
         torque = base.torque(robot, settings, sideways, view, command, observation)
         blind_time = jnp.where(valid, 0.0, state.blind_time + act_dt)
-        held = jnp.where(
-            blind_time < params.hold_time + 0.5 * act_dt, state.torque, _damping(params, joint_vel)
-        )
+        recent = blind_time < params.hold_time + 0.5 * act_dt
+        held = jnp.where(recent, state.torque, _damping(params, joint_vel))
         torque = jnp.where(valid, torque, held)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
 
         # Step 4: the local frame moves on with the trunk.
         base_vel = jnp.where(valid, view.base_vel, state.base_vel)
         motion = act_dt * base_vel
-        missing = state.stance & ~contact & (state.clock.elapsed > CONTACT_DELAY)
-        fault = jnp.where(state.stance, missing, denied).astype(torque.dtype)
-        share = state.contradiction + act_dt / FAULT_TIME * (fault - state.contradiction)
         next_state = state._replace(
             swing=swing.carry_along(swings, motion),
             ground=state.ground - motion[-1],
@@ -335,8 +249,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
             base_vel=base_vel,
             torque=torque,
             blind_time=blind_time,
-            contact_time=contact_time,
-            contradiction=jnp.where(valid, share, state.contradiction),
+            contact=jax.tree.map(lambda a, b: jnp.where(valid, a, b), flags.state, state.contact),
         )
         return next_state, torque
 
@@ -359,50 +272,12 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
     )
 
 
-FLICKER = 0.004  # s; a contact that is over sooner was none, or has bounced off
-CONTACT_DELAY = 0.05  # s into its stance, after which a foot without contact is a fault
-
-
-class _Reference(NamedTuple):
-    """What the body is to do: see the fields of the same names in ``ControllerState``."""
-
-    lag: Array
-    command: Array
-    velocity: Array
-    correction: Array
-
-
-def _next_reference(
-    params: ControllerParams,
-    state: ControllerState,
-    clock: gait.Clock,
-    body: PlanarState,
-    control_dt: float,
-) -> _Reference:
-    """Reference velocity, its integral, and the slow corrections, one control tick on."""
-    command = params.command.velocities[_piece(params.command.times, state.time)]
-    command = jnp.where(jnp.isfinite(command), command, state.velocity_command)
-    change = params.command_slew * control_dt
-    velocity = state.velocity + jnp.clip(command - state.velocity, -change, change)
-    periodic_ref = periodic_motion(params, clock.gait, clock.phase, clock.cycle, clock.elapsed)
-    error = jnp.stack([velocity - body.x[3], periodic_ref[1] - body.x[2]])
-    rate, limit = params.integral
-    # Errors beyond the limit are a step on its way, not a bias.
-    correction = state.correction + rate * control_dt * jnp.clip(error, -limit, limit)
-    # What one gait's model misses says nothing about another's.
-    switched = clock.gait != state.clock.gait
-    correction = jnp.where(switched, 0.0, jnp.clip(correction, -limit, limit))
-    slack = params.position_slack
-    lag = state.lag + (velocity + correction[0] - body.x[3]) * control_dt
-    return _Reference(jnp.clip(lag, -slack, slack), command, velocity, correction)
-
-
 def _next_swings(
     params: ControllerParams,
     state: ControllerState,
     clock: gait.Clock,
     stance: Array,
-    contact: Array,
+    flags: Array,
     feet: Array,
 ) -> swing.SwingState:
     """Swings after the clock has moved on: begun, ended, or given another time to come down."""
@@ -413,7 +288,7 @@ def _next_swings(
     remaining = gait.time_to_touchdown(params.schedule, clock)
     swings = swing.begin_swings(state.swing, lifting | retimed, feet, remaining)
     interrupted = stance & ~state.stance & switched
-    return swing.end_swings(params.swing, swings, stance, interrupted, contact, feet)
+    return swing.end_swings(params.swing, swings, stance, interrupted, flags, feet)
 
 
 def _mean_height(heights: Array, stance: Array, otherwise: Array) -> Array:
@@ -442,14 +317,3 @@ def _damping(params: ControllerParams, joint_vel: Array) -> Array:
     """Torques (4, 3) that slow the joints down; none where their rates are not known [N m]."""
     known = jnp.abs(joint_vel) <= MAX_JOINT_RATE
     return -params.blind_damping * jnp.where(known, joint_vel, 0.0)
-
-
-def next_clock(params: ControllerParams, state: ControllerState, control_dt: float) -> gait.Clock:
-    """Place in the gait at the next plan, ``control_dt`` [s] after the last one."""
-    wanted = params.gaits[_piece(params.gait_times, state.time)]
-    return gait.advance(params.schedule, state.clock, control_dt, wanted)
-
-
-def _piece(times: Float[Array, "K"], time: Float[Array, ""]) -> Int[Array, ""]:
-    """Index of the piece that ``time`` lies in; it begins at its start time, within rounding."""
-    return jnp.maximum(jnp.sum(time >= times - 1e-5) - 1, 0)

@@ -6,15 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax.legs import spatial
+from kjax.legs.contact import Flags
 from kjax.legs.kinematics import PlanarState, inverse, joint_rates
 from kjax.types import RobotParams
 
 MAX_JOINT_RATE = 20.0  # rad/s; below the Go1's 30, bounds the reference near singular legs
-# In free swings of trot and bound 99 of 100 samples are within 0.029 m of the path and within 0.4
-# to 0.6 of its speed (+ 0.2 m/s); 2 ms after a foot has hit a block, half of them are beyond 0.4.
-BEHIND = 0.03  # m
-SLOWED = 0.35
-LOW = 0.015  # m above the ground; a foot that is held there is where it wants to be anyway
 
 
 class SwingParams(NamedTuple):
@@ -140,66 +136,31 @@ def advance(state: SwingState, swinging: Bool[Array, "4"], dt: float) -> SwingSt
 def hold_feet(
     params: SwingParams,
     state: SwingState,
-    swinging: Bool[Array, "4"],
-    blocked: Bool[Array, "4"],
-    contact: Bool[Array, "4"],
-    flicker: Bool[Array, "4"],
+    flags: Flags,
     feet: Float[Array, "4 d"],
     dt: float,
 ) -> SwingState:
     """State with feet that hit something late in their swing held where they are.
 
-    A reaching foot sinks, and has arrived with its first contact.
+    A foot whose contact was over in a moment goes on. A reaching foot sinks, and has arrived with
+    its first contact.
 
     Args:
       params: swing settings.
       state: of the swings.
-      swinging: (4,) legs in the air.
-      blocked: (4,) feet that something is in the way of; see ``believable_contact``.
-      contact: (4,) contact flags.
-      flicker: (4,) flags that have just gone off after a moment: their feet go on.
+      flags: what the contact flags tell.
       feet: (4, d) where the feet are [m].
       dt: time step [s].
     """
     late = state.elapsed > params.hold_after * state.duration
-    caught = swinging & blocked & late & ~state.held
-    reaching = state.reaching & ~contact
+    caught = flags.blocked & late & ~state.held
+    reaching = state.reaching & ~flags.contact
     sink = jnp.where(reaching, params.reach_speed * dt, 0.0)
     return state._replace(
-        held=(state.held & ~flicker) | caught,
+        held=(state.held & ~flags.flicker) | caught,
         held_at=jnp.where(caught[:, None], feet, state.held_at.at[:, -1].add(-sink)),
         reaching=reaching,
     )
-
-
-def believable_contact(
-    contact_time: Float[Array, "4"],
-    elapsed: Float[Array, "4"],
-    feet: tuple[Float[Array, "4 d"], Float[Array, "4 d"]],
-    path: tuple[Float[Array, "4 d"], Float[Array, "4 d"]],
-    ground: Float[Array, ""],
-) -> tuple[Bool[Array, "4"], Bool[Array, "4"]]:
-    """Swing legs that something is in the way of, and those whose flag their kinematics deny.
-
-    A foot that has hit something slows down, falls behind its path, or is on the ground. One that
-    follows its path high above the ground touches nothing, whatever its flag says. A flag that has
-    been on since before the lift-off says nothing new.
-
-    Args:
-      contact_time: (4,) how long each flag has been on without a break [s].
-      elapsed: (4,) time since lift-off [s].
-      feet: (4, d) position of the feet, z last, and velocity [m, m/s].
-      path: the same of their paths.
-      ground: height of the foot centres on the ground [m].
-    """
-    (place, velocity), (wanted, wanted_rate) = feet, path
-    behind = jnp.sum((place - wanted) ** 2, axis=-1) > BEHIND**2
-    speed = jnp.sqrt(jnp.sum(wanted_rate**2, axis=-1))
-    slower = jnp.sum((velocity - wanted_rate) ** 2, axis=-1) > (SLOWED * (speed + 0.2)) ** 2
-    low = place[:, -1] < ground + LOW
-    flagged = contact_time > 0
-    possible = behind | slower | low
-    return flagged & (contact_time < elapsed) & possible, flagged & ~possible
 
 
 def foothold(

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from kjax.config import RunConfig
-from kjax.controller import Controller, ControllerState, build_controller
+from kjax.controller import Controller, build_controller
 from kjax.params import ControllerParams, build_params
 from kjax.robots import go1
 from kjax.sim import free_base
@@ -32,6 +32,7 @@ from kjax.sim.excitation import force_deviation, force_noise, perturb
 from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, noise_dim, resolve
 from kjax.sim.push import push_force, pushed_body
 from kjax.sim.scene import build_model, dress, foot_geoms
+from kjax.state import ControllerState
 from kjax.types import Command, Observation
 
 # Called once per control tick with the steps done, the steps in all and the data; return value

@@ -15,13 +15,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from kjax.config import RunConfig
-from kjax.controller import ControllerState, build_controller
+from kjax.controller import build_controller
 from kjax.legs.base import build_base
 from kjax.params import ControllerParams
 from kjax.sim.cases import Case
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
 from kjax.sim.excitation import force_deviation, force_row, perturb
 from kjax.sim.observe import add_noise, build_observe
+from kjax.state import ControllerState
 from kjax.types import Observation
 
 

@@ -20,12 +20,14 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from kjax import gait
 from kjax.config import NoiseConfig, RunConfig
-from kjax.controller import ControllerState, build_controller, next_clock
+from kjax.controller import build_controller
 from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState
 from kjax.params import ControllerParams
+from kjax.reference import next_clock
 from kjax.rigid_body import body_numbers
 from kjax.robots import go1
+from kjax.state import ControllerState
 from kjax.tuning import plant as body_plant
 from kjax.tuning.plant import PlantParams
 from kjax.types import GRAVITY, STATE_DIM, Command, RobotParams

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kjax.legs import kinematics, swing
+from kjax.legs.contact import Flags, initial_contact
 from kjax.robots import go1
 from kjax.types import Leg, Observation, RobotParams
 
@@ -15,6 +16,7 @@ DURATION, APEX, ACROSS, HOLD_AFTER = 0.25, 0.06, 0.9, 0.3
 LIFT_OFF = np.array([[0.2, 0.02], [0.2, 0.02], [-0.2, 0.05], [-0.2, 0.05]])
 TARGET = np.array([[0.3, 0.02], [0.15, 0.07], [-0.1, 0.02], [-0.2, 0.05]])
 OFFSET = np.array([0.01, 0.02, -0.03, -0.04])  # m, foothold ahead of the hip
+NONE = np.zeros(4, bool)
 ROUNDING = {"float32": 1e-6, "float64": 1e-14}  # ten roundings on lengths below 1 m
 
 
@@ -22,10 +24,17 @@ def where_feet_shall_be(params, state, target):
     return swing.held_or_on_path(params, state, *swing.foot_path(params, state, target))
 
 
+def flags_of(contact, *, blocked=NONE, flicker=NONE):
+    """Flags as the contact logic hands them on; its own state plays no part here."""
+    return Flags(
+        state=initial_contact(np.dtype(float)), contact=contact, blocked=blocked, flicker=flicker
+    )
+
+
 def one_step(params, state, swinging, contact, feet, dt):
-    never = jnp.zeros(4, bool)
     state = swing.advance(state, swinging, dt)
-    return swing.hold_feet(params, state, swinging, contact, contact, never, feet, dt)
+    flags = flags_of(contact, blocked=swinging & contact)
+    return swing.hold_feet(params, state, flags, feet, dt)
 
 
 reference = jax.jit(where_feet_shall_be)
@@ -371,36 +380,13 @@ def test_the_state_keeps_its_tree_shapes_and_dtypes_and_traces_once(dtype):
         chex.assert_trees_all_equal_shapes_and_dtypes(new, state)
 
 
-def test_a_contact_is_believed_where_the_foot_slows_falls_behind_or_is_on_the_ground():
-    """Legs: on its path in the air; stopped by something; behind its path; on the ground."""
-    place = np.array([[0.1, 0.06], [0.1, 0.06], [0.1, 0.06], [0.1, 0.01]])
-    wanted = place + np.array([[0.0, 0.0], [0.0, 0.0], [0.04, 0.0], [0.0, 0.0]])
-    rate = np.tile([1.0, 0.0], (4, 1))
-    speed = rate * np.array([[1.0], [0.1], [1.0], [1.0]])
-
-    def believed(contact_time, elapsed=0.1):
-        return jax.jit(swing.believable_contact)(
-            jnp.full(4, contact_time), jnp.full(4, elapsed), (place, speed), (wanted, rate), 0.0
-        )
-
-    blocked, denied = believed(0.002)
-    assert blocked.tolist() == [False, True, True, True]
-    assert denied.tolist() == [True, False, False, False]
-    # On since before the lift-off: it says nothing of this swing.
-    assert not believed(0.2)[0].any()
-    assert believed(0.2)[1].tolist() == [True, False, False, False]
-    # Off: nothing to believe.
-    assert not np.any(believed(0.0))
-
-
 def test_a_foot_held_for_a_moment_goes_on_with_its_path():
-    state, none, air = swinging(0.15), jnp.zeros(4, bool), jnp.ones(4, bool)
     hit = jnp.array([True, True, False, False])
     feet = jnp.asarray(TARGET)
-    held = swing.hold_feet(settings(), state, air, hit, hit, none, feet, 0.001)
+    held = swing.hold_feet(settings(), swinging(0.15), flags_of(hit, blocked=hit), feet, 0.001)
     assert held.held.tolist() == [True, True, False, False]
-    flicker = jnp.array([True, False, False, False])
-    after = swing.hold_feet(settings(), held, air, none, none, flicker, feet, 0.001)
+    over = flags_of(NONE, flicker=jnp.array([True, False, False, False]))
+    after = swing.hold_feet(settings(), held, over, feet, 0.001)
     assert after.held.tolist() == [False, True, False, False]
 
 

@@ -1,0 +1,84 @@
+"""What the controller remembers from call to call, and what a plan tells of itself."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float, Int
+
+from kjax import gait
+from kjax.legs.contact import ContactState
+from kjax.legs.swing import SwingState
+from kjax.mpc.lmpc import LmpcMemory
+
+
+class ControllerState(NamedTuple):
+    """What the controller remembers between calls; nothing in it depends on where zero is.
+
+    Points are in the *local* frame: origin at the trunk's, axes of the world (planar base) or of
+    the track frame of ``legs.spatial`` (free base). They are carried along by the trunk's velocity,
+    so that no position estimate enters.
+
+    Attributes:
+      time: since ``init`` [s].
+      clock: place in the gait.
+      stance: (4,) scheduled stance legs.
+      lag: reference of p_x less p_x, the integral of the velocity's error, bounded [m].
+      velocity_command: velocity commanded now [m/s].
+      ground: height of the ground under the last stance feet, local frame [m].
+      velocity: reference of v_x, which follows the command at a bounded rate [m/s].
+      correction: integrals of the errors of velocity and pitch, added to their references
+        [m/s, rad].
+      memory: of the LMPC within a stance: its last plan and where the QP goes on from.
+      force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
+      swing: state of the swing legs, local frame.
+      feet: (4, d) foot centres in the last valid sample, local frame [m].
+      base_vel: (d,) velocity of the trunk in that sample, local axes [m/s].
+      torque: (4, 3) last torque of a valid sample [N m].
+      blind_time: time without a valid sample [s].
+      contact: what is made of the contact flags.
+      track: (2,) cosine and sine of the heading to keep, the trunk's at ``init``, world [-];
+        ``None`` on the planar base.
+    """
+
+    time: Float[Array, ""]
+    clock: gait.Clock
+    stance: Bool[Array, "4"]
+    lag: Float[Array, ""]
+    velocity_command: Float[Array, ""]
+    ground: Float[Array, ""]
+    velocity: Float[Array, ""]
+    correction: Float[Array, "2"]
+    memory: LmpcMemory
+    force: Float[Array, "4 2"]
+    swing: SwingState
+    feet: Float[Array, "4 d"]
+    base_vel: Float[Array, "d"]
+    torque: Float[Array, "4 3"]
+    blind_time: Float[Array, ""]
+    contact: ContactState
+    track: Float[Array, "2"] | None
+
+
+class PlanInfo(NamedTuple):
+    """What a plan did; for logs and for callers that must know.
+
+    Attributes:
+      status: a ``qp.Status``. At the iteration limit the solver's last point is in force; with
+        faulty data the shifted last plan is.
+      residual: relative KKT residual of the solver's point [-].
+      iterations: of the solver.
+      mode: contact mode.
+      x: (6,) SRB state as estimated from the observation; p_x and p_z from the ground below the
+        centre of mass [m, rad, m/s, rad/s].
+      reference: (6,) state wanted one model step ahead, likewise.
+      contact_fault: (4,) legs whose contact flag keeps contradicting their kinematics.
+      blind_time: time without a valid sample, this one included [s].
+    """
+
+    status: Int[Array, ""]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    mode: Int[Array, ""]
+    x: Float[Array, "6"]
+    reference: Float[Array, "6"]
+    contact_fault: Bool[Array, "4"]
+    blind_time: Float[Array, ""]
