@@ -12,7 +12,8 @@ from kjax.qp.problem import (
     prepare,
     start,
 )
-from kjax.qp.rows import ROW_METHODS, MethodUsed, RowMethod, RowSolution, solve_rows
+from kjax.qp.row_methods import ROW_METHODS, MethodUsed, RowMethod
+from kjax.qp.rows import RowSolution, solve_rows
 
 __all__ = [
     "METHODS",

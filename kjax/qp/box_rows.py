@@ -19,8 +19,9 @@ from kjax.qp.box import Method, solve
 from kjax.qp.polish import solve_equations
 from kjax.qp.problem import Prepared, Status, Warm, no_tangent
 from kjax.qp.row_derivative import active_equations
+from kjax.qp.row_methods import RowMethod
 from kjax.qp.row_problem import rows_error
-from kjax.qp.rows import RowMethod, solve_rows
+from kjax.qp.rows import solve_rows
 
 
 class BoxRowSolution(NamedTuple):

@@ -16,41 +16,30 @@ it is that of one side, and where active rows depend on one another the multipli
 several; ``RowSolution.margin`` tells how near the former is.
 """
 
-from enum import IntEnum
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from kjax.qp.active_set import ActiveSet, farkas, solve_active_set
 from kjax.qp.batching import where_needed
-from kjax.qp.certificates import Verdict, classify, proves_infeasible
-from kjax.qp.interior import descend_central_path
-from kjax.qp.polish import polish, solve_equations
+from kjax.qp.certificates import Verdict
+from kjax.qp.polish import solve_equations
 from kjax.qp.problem import Status, no_tangent
 from kjax.qp.row_derivative import active_equations
-from kjax.qp.row_problem import (
-    RowProblem,
-    RowScaling,
-    contradicts,
-    kkt_errors,
-    scale_rows,
-    snapped,
+from kjax.qp.row_methods import (
+    ROW_METHODS,
+    RowData,
+    RowMethod,
+    RowSettings,
+    better_by_interior_point,
+    by_active_set,
+    by_interior_point,
+    by_splitting,
+    classified,
 )
-from kjax.qp.splitting import solve_splitting
-
-RowMethod = Literal["auto", "active_set", "interior_point", "admm"]
-ROW_METHODS: tuple[RowMethod, ...] = ("auto", "active_set", "interior_point", "admm")
-
-
-class MethodUsed(IntEnum):
-    """Which method a ``RowSolution`` comes from."""
-
-    ACTIVE_SET = 0
-    INTERIOR_POINT = 1
-    ADMM = 2
+from kjax.qp.row_problem import scale_rows
 
 
 class RowSolution(NamedTuple):
@@ -79,12 +68,6 @@ class RowSolution(NamedTuple):
     margin: Float[Array, ""]
     iterations: Int[Array, ""]
     method: Int[Array, ""]
-
-
-class _Settings(NamedTuple):
-    method: RowMethod
-    tolerance: float
-    max_iterations: int
 
 
 def solve_rows(
@@ -131,18 +114,18 @@ def solve_rows(
         raise ValueError(f"max_iterations must be at least 1, got {max_iterations}")
     if not tolerance > 0:
         raise ValueError(f"tolerance must be above 0, got {tolerance}")
-    settings = _Settings(method, tolerance, max_iterations)
+    settings = RowSettings(method, tolerance, max_iterations)
     warm = None if warm is None else jax.lax.stop_gradient(warm)
     return _differentiable(settings, warm, H, q, C, row_lower, row_upper, lower, upper)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _differentiable(settings: _Settings, warm: Array | None, *data: Array) -> RowSolution:
+def _differentiable(settings: RowSettings, warm: Array | None, *data: Array) -> RowSolution:
     return _solve(settings, warm, *data)
 
 
 @_differentiable.defjvp
-def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _derivative(settings: RowSettings, primals: Any, tangents: Any) -> tuple[Any, Any]:
     _, H, q, C, row_lower, row_upper, lower, upper = primals
     _, dH, dq, dC, d_row_lower, d_row_upper, d_lower, d_upper = tangents
     solution = _differentiable(settings, *primals)
@@ -160,46 +143,8 @@ def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, 
     )
 
 
-class _Data(NamedTuple):
-    """The caller's problem, faulty data replaced; H symmetric, the box's bounds last."""
-
-    H: Array
-    q: Array
-    C: Array
-    low: Array
-    high: Array
-    good: Array
-
-
-class _Found(NamedTuple):
-    """What a method hands back: the point in the caller's units, and what is known of it.
-
-    Attributes:
-      x: (n,) point, clipped.
-      y: (m + n,) multipliers.
-      error: (3,) ``kkt_errors``.
-      margin: see ``RowSolution``.
-      usable: whether H is such that the method can be used.
-      infeasible: whether that is proven.
-      iterations: spent.
-      method: a ``MethodUsed``.
-    """
-
-    x: Array
-    y: Array
-    error: Array
-    margin: Array
-    usable: Array
-    infeasible: Array
-    iterations: Array
-    method: Array
-
-    def solved(self, tolerance: float) -> Array:
-        return jnp.max(self.error) <= tolerance
-
-
 def _solve(
-    settings: _Settings,
+    settings: RowSettings,
     warm: Array | None,
     H: Array,
     q: Array,
@@ -216,7 +161,7 @@ def _solve(
     finite = finite & ~(jnp.isnan(low) | jnp.isnan(high)).any()
     consistent = ((low <= high) & (low < jnp.inf) & (high > -jnp.inf)).all()
     sound = finite & consistent
-    data = _Data(
+    data = RowData(
         jnp.where(sound, 0.5 * (H + H.T), jnp.eye(n, dtype=H.dtype)),
         jnp.where(sound, q, 0.0),
         jnp.where(sound, C, 0.0),
@@ -229,16 +174,16 @@ def _solve(
     problem, scaling = scale_rows(*data[:5], equilibrate=not by_curvature)
     inner = settings._replace(tolerance=tolerance)
     if settings.method == "interior_point":  # step 2
-        found = _by_interior_point(inner, problem, scaling, data)
+        found = by_interior_point(inner, problem, scaling, data)
     elif settings.method == "admm":
-        found = _by_splitting(inner, problem, scaling, data, warm)
+        found = by_splitting(inner, problem, scaling, data, warm)
     else:
-        found = _by_active_set(inner, problem, scaling, data)
+        found = by_active_set(inner, problem, scaling, data)
     if settings.method == "auto":
         defeated = ~found.solved(tolerance) & (found.iterations < settings.max_iterations)
         found = where_needed(
             data.good & (~found.usable | (defeated & ~found.infeasible)),
-            partial(_better_by_interior_point, inner),
+            partial(better_by_interior_point, inner),
             found,
             data,
         )
@@ -247,7 +192,7 @@ def _solve(
     if settings.method != "active_set":  # step 4; it proves infeasibility as it goes
         verdict = where_needed(
             data.good & found.usable & ~solved & ~found.infeasible,
-            partial(_classified, tolerance),
+            partial(classified, tolerance),
             verdict,
             data,
         )
@@ -290,164 +235,4 @@ def _solve(
         margin=jnp.where(usable, found.margin, 0.0),
         iterations=found.iterations,
         method=found.method,
-    )
-
-
-def _by_active_set(
-    settings: _Settings, problem: RowProblem, scaling: RowScaling, data: _Data
-) -> _Found:
-    state, definite = solve_active_set(
-        problem, data.good, 0.1 * settings.tolerance, settings.max_iterations
-    )
-    found = _judge(
-        problem, scaling, data, state.x, state.multipliers,
-        state.bound_status > 0, state.bound_status < 0, usable=definite | ~data.good,
-        infeasible=state.infeasible, iterations=state.iterations, method=MethodUsed.ACTIVE_SET,
-    )  # fmt: skip
-
-    def proven(_: Array, state: ActiveSet, problem: Any, scaling: Any, data: Any) -> Array:
-        claimed = state.infeasible & proves_infeasible(problem, farkas(problem, state))
-        return claimed | contradicts(scaling, data.C, data.low, data.high, settings.tolerance)
-
-    needed = data.good & definite & ~found.solved(settings.tolerance)
-    infeasible = where_needed(needed, proven, jnp.zeros((), bool), state, problem, scaling, data)
-    return found._replace(infeasible=infeasible)
-
-
-def _by_interior_point(
-    settings: _Settings, problem: RowProblem, scaling: RowScaling, data: _Data
-) -> _Found:
-    usable = _semidefinite(problem) | ~data.good
-    x, y, count = descend_central_path(
-        problem,
-        data.good & usable,
-        tolerance=0.5 * settings.tolerance,
-        max_iterations=settings.max_iterations,
-    )
-    return _judge_or_polish(
-        settings, problem, scaling, data, x, y, usable=usable, infeasible=jnp.zeros((), bool),
-        iterations=count, method=MethodUsed.INTERIOR_POINT,
-    )  # fmt: skip
-
-
-def _by_splitting(
-    settings: _Settings, problem: RowProblem, scaling: RowScaling, data: _Data, warm: Array | None
-) -> _Found:
-    usable = _semidefinite(problem) | ~data.good
-    if warm is not None:
-        warm = jnp.where(jnp.isfinite(warm), warm - scaling.at, 0.0) / scaling.x
-        warm = jnp.where(scaling.fixed, 0.0, warm)
-    result = solve_splitting(
-        problem,
-        data.good & usable,
-        warm,
-        tolerance=0.5 * settings.tolerance,
-        max_iterations=settings.max_iterations,
-    )
-    return _judge_or_polish(
-        settings, problem, scaling, data, result.x, result.multipliers, usable=usable,
-        infeasible=result.infeasible, iterations=result.iterations, method=MethodUsed.ADMM,
-    )  # fmt: skip
-
-
-def _better_by_interior_point(settings: _Settings, old: _Found, data: _Data) -> _Found:
-    problem, scaling = scale_rows(*data[:5])
-    new = _by_interior_point(settings, problem, scaling, data)
-    new = new._replace(iterations=old.iterations + new.iterations)
-    keep = old.usable & (jnp.max(old.error) <= jnp.max(new.error))
-    return jax.tree.map(lambda a, b: jnp.where(keep, a, b), old, new)
-
-
-def _classified(tolerance: float, old: Verdict, data: _Data) -> Verdict:
-    del old
-    problem, scaling = scale_rows(*data[:5])
-    verdict = classify(problem, data.good)
-    m = data.C.shape[0]
-    x = jnp.clip(verdict.x * scaling.x + scaling.at, data.low[m:], data.high[m:])
-    contradicted = contradicts(scaling, data.C, data.low, data.high, tolerance)
-    return Verdict(verdict.infeasible | contradicted, verdict.unbounded & ~contradicted, x)
-
-
-def _semidefinite(problem: RowProblem) -> Array:
-    """Whether H is positive semidefinite to working precision."""
-    n, eps = problem.q.shape[0], float(jnp.finfo(problem.q.dtype).eps)
-    size = jnp.max(jnp.abs(problem.H), initial=0.0)
-    H = problem.H / jnp.where(size > 0, size, 1.0)
-    ridge = 10.0 * n * eps * jnp.eye(n, dtype=H.dtype)
-    return jnp.isfinite(jnp.linalg.cholesky(H + ridge)).all()
-
-
-def _judge_or_polish(
-    settings: _Settings,
-    problem: RowProblem,
-    scaling: RowScaling,
-    data: _Data,
-    x: Array,
-    y: Array,
-    *,
-    usable: Array,
-    infeasible: Array,
-    iterations: Array,
-    method: MethodUsed,
-) -> _Found:
-    """The judged point; polished on its active rows where it is not good enough as it is."""
-    never = jnp.zeros_like(problem.has_low)
-    found = _judge(
-        problem, scaling, data, x, y, never, never,
-        usable=usable, infeasible=infeasible, iterations=iterations, method=method,
-    )  # fmt: skip
-
-    def polished(old: _Found, problem: Any, scaling: Any, data: Any, x: Array, y: Array) -> _Found:
-        fine = _judge(
-            problem, scaling, data, *polish(problem, x, y), usable=old.usable,
-            infeasible=old.infeasible, iterations=old.iterations, method=method,
-        )  # fmt: skip
-        better = jnp.max(fine.error) < jnp.max(old.error)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), fine, old)
-
-    needed = data.good & usable & ~found.solved(settings.tolerance)
-    return where_needed(needed, polished, found, problem, scaling, data, x, y)
-
-
-def _judge(
-    problem: RowProblem,
-    scaling: RowScaling,
-    data: _Data,
-    x_hat: Array,
-    y_hat: Array,
-    at_low: Array,
-    at_high: Array,
-    *,
-    usable: Array,
-    infeasible: Array,
-    iterations: Array,
-    method: MethodUsed,
-) -> _Found:
-    """Step 3. A bound that is active (``at_low``, ``at_high``) is kept to the last bit."""
-    m = data.C.shape[0]
-    lower, upper = data.low[m:], data.high[m:]
-    x = jnp.clip(snapped(x_hat) * scaling.x + scaling.at, lower, upper)
-    x = jnp.where(at_low[m:], lower, jnp.where(at_high[m:], upper, x))
-    y = y_hat * scaling.multipliers
-    y = jnp.where(jnp.concatenate([scaling.immovable, jnp.zeros_like(scaling.fixed)]), 0.0, y)
-    d = jnp.where(scaling.fixed, 0.0, scaling.x)
-    error, y, value = kkt_errors(
-        data.H, data.q, data.C, data.low, data.high, d, scaling.values, x, y
-    )
-    force = y / scaling.multipliers
-    slack_low, slack_high = (
-        (value - data.low) / scaling.values,
-        (data.high - value) / scaling.values,
-    )
-    below = jnp.where(problem.has_low, jnp.maximum(slack_low, -force), jnp.inf)
-    above = jnp.where(problem.has_high, jnp.maximum(slack_high, force), jnp.inf)
-    return _Found(
-        x=x,
-        y=y,
-        error=error,
-        margin=jnp.min(jnp.minimum(below, above), initial=jnp.inf),
-        usable=usable,
-        infeasible=infeasible,
-        iterations=iterations,
-        method=jnp.asarray(method, jnp.int32),
     )
