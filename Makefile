@@ -29,11 +29,14 @@ reproduce: setup  ## all of the paper's figures and numbers; goes on where it st
 envelope: setup  ## limits of each gait by bisection over seeds; goes on where it stopped
 	$(BIN)/python experiments/envelope.py
 
+# A crashed worker ends the run: with another in its place pytest-xdist waits for ever.
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+
 test: setup  ## everything
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
 
 test-fast: setup  ## without the slow tests
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+	$(PYTEST) -m "not slow"
 
 check: setup  ## what to run before a commit
 	$(BIN)/ruff format --check .

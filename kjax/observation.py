@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from kjax.legs import kinematics, spatial
 from kjax.types import Leg, Observation, RobotParams
@@ -64,20 +64,31 @@ def is_valid(observation: Observation) -> Bool[Array, ""]:
     )
 
 
+def standing(joint_pos: Float[Array, "4 3"] | None = None) -> Observation:
+    """What is measured of a robot that stands still and level on all feet.
+
+    Args:
+      joint_pos: (4, 3) of its joints; a common crouch where not given [rad].
+    """
+    if joint_pos is None:
+        joint_pos = jnp.tile(jnp.array([0.0, 0.9, -1.8]), (4, 1))
+    return Observation(
+        base_pos=jnp.zeros(3),
+        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
+        base_vel=jnp.zeros(3),
+        base_ang_vel=jnp.zeros(3),
+        joint_pos=joint_pos,
+        joint_vel=jnp.zeros((4, 3)),
+        contact=jnp.ones(4, bool),
+    )
+
+
 def or_neutral(observation: Observation, valid: Bool[Array, ""]) -> Observation:
     """The observation, or a robot that stands still where it is not valid, so that no NaN spreads.
 
     The trunk's position is left at zero: the controller does not read it.
     """
-    neutral = Observation(
-        base_pos=jnp.zeros(3),
-        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
-        base_vel=jnp.zeros(3),
-        base_ang_vel=jnp.zeros(3),
-        joint_pos=jnp.tile(jnp.array([0.0, 0.9, -1.8]), (4, 1)),
-        joint_vel=jnp.zeros((4, 3)),
-        contact=observation.contact,
-    )
+    neutral = standing()._replace(contact=observation.contact)
     seen = observation._replace(base_pos=jnp.zeros_like(observation.base_pos))
     return jax.tree.map(
         lambda there, safe: jnp.where(valid, there, safe.astype(there.dtype)), seen, neutral

@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from kjax.config import RunConfig, SrbConfig
 from kjax.legs import kinematics
-from kjax.types import GRAVITY, Mode, Observation, RobotParams
+from kjax.observation import standing
+from kjax.types import GRAVITY, Mode, RobotParams
 
 
 def own_body(srb: SrbConfig, robot: RobotParams, height: float = 0.27) -> SrbConfig:
@@ -53,16 +54,8 @@ def _standing_com(robot: RobotParams, height: float) -> tuple[Array, Array]:
         drop = height - robot.foot_radius - com[1]
         foot = jnp.stack([jnp.zeros(4), -drop - hips[:, 1]], axis=-1)
         thigh, calf, _trig = kinematics.inverse(robot, foot)
-        standing = Observation(
-            base_pos=jnp.zeros(3),
-            base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
-            base_vel=jnp.zeros(3),
-            base_ang_vel=jnp.zeros(3),
-            joint_pos=jnp.stack([jnp.zeros(4), thigh, calf], axis=-1),
-            joint_vel=jnp.zeros((4, 3)),
-            contact=jnp.ones(4, bool),
-        )
-        return kinematics.planar_state(robot, standing).x[:2]
+        joints = jnp.stack([jnp.zeros(4), thigh, calf], axis=-1)
+        return kinematics.planar_state(robot, standing(joints)).x[:2]
 
     # The legs' share of the centre of mass moves little with the posture: this contracts fast.
     return jax.lax.fori_loop(0, 20, again, jnp.zeros(2)), hips

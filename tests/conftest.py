@@ -1,5 +1,6 @@
 """Settings that every test runs under, and the expensive things that tests share."""
 
+import gc
 import os
 from functools import cache
 from pathlib import Path
@@ -67,6 +68,17 @@ def pytest_collection_modifyitems(items):
 def _fresh_trace_counter():
     """``chex.assert_max_traces`` counts by name and line; start each test from zero."""
     chex.clear_trace_counter()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _drop_compiled_programs():
+    """Let go of what a file compiled: a process may hold 65,530 mappings (Linux's default).
+
+    Each program takes tens of them, the largest hundreds, and past the limit XLA crashes.
+    """
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture(params=["float32", "float64"])

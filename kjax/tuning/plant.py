@@ -21,8 +21,9 @@ from kjax.legs.base import View
 from kjax.legs.kinematics import PlanarState, inverse, leg_trig, moving_moments, planar_state
 from kjax.legs.stance import stance_torque
 from kjax.legs.swing import joint_reference
+from kjax.observation import standing
 from kjax.robots import go1
-from kjax.types import Observation, RobotParams
+from kjax.types import RobotParams
 
 
 class PlantParams(NamedTuple):
@@ -74,19 +75,10 @@ def nominal_plant(
       link_inertia: of a thigh and a calf about their centres of mass [kg m^2].
       spin: part of the legs' angular momentum that counts [-].
     """
-    standing = Observation(
-        base_pos=jnp.zeros(3),
-        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
-        base_vel=jnp.zeros(3),
-        base_ang_vel=jnp.zeros(3),
-        joint_pos=jnp.tile(jnp.array([0.0, 0.9, -1.8]), (4, 1)),
-        joint_vel=jnp.zeros((4, 3)),
-        contact=jnp.ones(4, bool),
-    )
     return PlantParams(
         mass=jnp.asarray(mass, float),
         inertia=jnp.asarray(inertia, float),
-        com=planar_state(robot, standing).x[:2],
+        com=planar_state(robot, standing()).x[:2],
         friction=jnp.asarray(friction, float),
         lag=jnp.asarray(lag, float),
         gain=jnp.asarray(gain, float),
