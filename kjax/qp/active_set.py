@@ -11,9 +11,9 @@ With N the normals of the active rows, each pointing inwards, two matrices are k
    nothing can give way to proves the problem infeasible.
 4. Either event changes the stack (P, U) by one outer product, so nothing is factorised after H.
    Go to step 2.
-5. Polish: two Newton steps of the equations that the active rows make. Where the unconstrained
-   minimiser lay far outside, rounding has hidden violations that show now: then once more from
-   step 2.
+5. Polish: a Newton step of the equations that the active rows make, a second one where the first
+   was not small. Where the unconstrained minimiser lay far outside, rounding has hidden violations
+   that show now: then once more from step 2.
 
 The multipliers stay right at every step and the objective rises, so the method ends. Few active
 rows, the case of a legged robot, mean few iterations.
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from kjax.qp.batching import while_any
+from kjax.qp.batching import where_needed, while_any
 from kjax.qp.row_problem import RowProblem
 
 ROUNDS = 3  # of steps 2 to 5; one is usual
@@ -69,8 +69,19 @@ class ActiveSet(NamedTuple):
 class _Settings(NamedTuple):
     tolerance: float
     max_iterations: int
-    rounding: float
     rounds: int
+
+
+class _Sizes(NamedTuple):
+    """What a problem's numbers are measured by, found once.
+
+    Attributes:
+      flat: curvature along a normal that is rounding.
+      outside: size of the unconstrained minimiser, roughly.
+    """
+
+    flat: Array
+    outside: Array
 
 
 def solve_active_set(
@@ -113,17 +124,15 @@ def solve_active_set(
     settings = _Settings(
         tolerance=max(tolerance, 10.0 * eps),
         max_iterations=max_iterations,
-        rounding=max(10.0 * eps, min(30.0 * n * eps, 1e-11)),
         # In float32 what a second round finds is rounding again.
         rounds=ROUNDS if eps < 1e-12 else 1,
     )
-    state = while_any(
-        lambda state: state.pending,
-        partial(_round, settings),
-        state,
-        problem,
-        settings.rounding * jnp.max(jnp.diagonal(inverse)),
+    rounding = max(10.0 * eps, min(30.0 * n * eps, 1e-11))
+    sizes = _Sizes(
+        flat=rounding * jnp.max(jnp.diagonal(inverse)),
+        outside=jnp.max(jnp.abs(problem.q)) / curvature,
     )
+    state = while_any(lambda state: state.pending, partial(_round, settings), state, problem, sizes)
     return state, definite
 
 
@@ -139,24 +148,39 @@ def farkas(problem: RowProblem, state: ActiveSet) -> Float[Array, "M"]:
     return state.bound_status * given - jnp.where(is_chosen, state.sign, 0.0)
 
 
-def _round(
-    settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array
-) -> ActiveSet:
+def _round(settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _Sizes) -> ActiveSet:
     """Steps 2 to 4 until no row is violated, then step 5: pending again if one is violated now."""
     found = while_any(
         lambda state: state.pending,
         partial(_advance, settings),
-        _choose(settings, state, problem),
+        _choose(settings, state, problem, sizes),
         problem,
-        rounding,
+        sizes,
     )
-    found = _polish(problem, _polish(problem, found))
-    found = found._replace(rounds=state.rounds + 1, pending=state.rounds < settings.rounds - 1)
-    found = _choose(settings, found, problem)
-    return jax.tree.map(lambda new, old: jnp.where(state.pending, new, old), found, state)
+    eps = float(jnp.finfo(problem.q.dtype).eps)
+    more = state.pending & (state.rounds < settings.rounds - 1)
+    x, y = _polish(problem, found)
+    # The next correction is as small beside this one as this one is beside x.
+    coarse = jnp.max(jnp.abs(x - found.x)) > eps**0.5 * jnp.max(jnp.abs(x))
+    x, y = where_needed(
+        coarse,
+        lambda point, found, problem: _polish(problem, found._replace(x=point[0], y=point[1])),
+        (x, y),
+        found,
+        problem,
+    )
+    fine = found._replace(x=x, y=y, rounds=state.rounds + 1, pending=more)
+    fine = _choose(settings, fine, problem, sizes)
+    # What has finished stays as it is. Its stack, the bulk of it, has not been touched.
+    kept = jax.tree.map(
+        lambda new, old: jnp.where(state.pending, new, old),
+        fine._replace(stack=state.x),
+        state._replace(stack=state.x),
+    )
+    return kept._replace(stack=found.stack)
 
 
-def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem) -> ActiveSet:
+def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _Sizes) -> ActiveSet:
     """Step 2: the row that is violated most."""
     value = problem.rows(state.x)
     inactive = state.bound_status == 0
@@ -169,9 +193,7 @@ def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem) -> Activ
     bound = jnp.where(below >= above, jnp.abs(problem.low), jnp.abs(problem.high))
     size = jnp.maximum(jnp.max(jnp.abs(state.x)), 1.0)  # of x, which is 1 where it is not far out
     # Before the first polish, rounding is that of the unconstrained minimiser.
-    curvature = jnp.max(jnp.diagonal(problem.H))
-    outside = jnp.max(jnp.abs(problem.q)) / jnp.where(curvature > 0, curvature, 1.0)
-    noise = jnp.where(state.rounds == 0, 10.0 * jnp.maximum(size, outside), 100.0 * size)
+    noise = jnp.where(state.rounds == 0, 10.0 * jnp.maximum(size, sizes.outside), 100.0 * size)
     own = settings.tolerance * (bound + jnp.abs(value)) + eps * noise
     violation = jnp.where(violation > own, violation, -jnp.inf)
     # Equations come first, and count even where they hold by chance.
@@ -193,7 +215,7 @@ def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem) -> Activ
 
 
 def _advance(
-    settings: _Settings, state: ActiveSet, problem: RowProblem, rounding: Array
+    settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _Sizes
 ) -> ActiveSet:
     """Steps 3 and 4: add the chosen row, or drop the one that is in its way; then step 2."""
     n, dtype = problem.q.shape[0], problem.q.dtype
@@ -215,7 +237,7 @@ def _advance(
     dropped = jnp.argmin(ratio).astype(jnp.int32)
     t_drop = ratio[dropped]
     # A row that depends on the active ones moves nothing: rounding alone is left of its curvature.
-    depends = curvature <= rounding
+    depends = curvature <= sizes.flat
     t_add = jnp.where(
         depends, jnp.inf, jnp.maximum(violation, 0.0) / jnp.where(depends, 1.0, curvature)
     )
@@ -253,7 +275,7 @@ def _advance(
         infeasible=state.infeasible | fails,
         iterations=state.iterations + pending,
     )
-    chosen = _choose(settings, moved, problem)
+    chosen = _choose(settings, moved, problem, sizes)
     # A row that could not be added yet is tried again.
     again = drop & (moved.iterations < settings.max_iterations)
     return chosen._replace(
@@ -263,8 +285,8 @@ def _advance(
     )
 
 
-def _polish(problem: RowProblem, state: ActiveSet) -> ActiveSet:
-    """A Newton step of the equations that the active rows make, for what rounding has left."""
+def _polish(problem: RowProblem, state: ActiveSet) -> tuple[Float[Array, "n"], Float[Array, "M"]]:
+    """Point and multipliers after a Newton step of the equations that the active rows make."""
     n = problem.q.shape[0]
     P, U = state.stack[:n], state.stack[n:]
     push = problem.adjoint(state.bound_status * state.y)
@@ -273,4 +295,4 @@ def _polish(problem: RowProblem, state: ActiveSet) -> ActiveSet:
     active = (state.bound_status != 0) & (jnp.abs(U).max(axis=1) > 0)
     r_primal = jnp.where(active, state.bound_status * (wanted - problem.rows(state.x)), 0.0)
     dx = P @ r_dual + U.T @ r_primal
-    return state._replace(x=state.x + dx, y=state.y + U @ (problem.H @ dx - r_dual))
+    return state.x + dx, state.y + U @ (problem.H @ dx - r_dual)

@@ -91,10 +91,18 @@ class Found(NamedTuple):
         return jnp.max(self.error) <= tolerance
 
 
+class Evidence(NamedTuple):
+    """What the active set leaves behind, for the proof that nothing keeps all rows."""
+
+    state: ActiveSet
+    problem: RowProblem
+    scaling: RowScaling
+
+
 def by_active_set(
     settings: RowSettings, problem: RowProblem, scaling: RowScaling, data: RowData
-) -> Found:
-    """Dual active set; H must be positive definite, and infeasibility is proven as it goes."""
+) -> tuple[Found, Evidence]:
+    """Dual active set; H must be positive definite. ``infeasible`` is claimed, not yet proven."""
     state, definite = solve_active_set(
         problem, data.good, 0.1 * settings.tolerance, settings.max_iterations
     )
@@ -103,14 +111,17 @@ def by_active_set(
         state.bound_status > 0, state.bound_status < 0, usable=definite | ~data.good,
         infeasible=state.infeasible, iterations=state.iterations, method=MethodUsed.ACTIVE_SET,
     )  # fmt: skip
+    return found, Evidence(state, problem, scaling)
 
-    def proven(_: Array, state: ActiveSet, problem: Any, scaling: Any, data: Any) -> Array:
-        claimed = state.infeasible & proves_infeasible(problem, farkas(problem, state))
-        return claimed | contradicts(scaling, data.C, data.low, data.high, settings.tolerance)
 
-    needed = data.good & definite & ~found.solved(settings.tolerance)
-    infeasible = where_needed(needed, proven, jnp.zeros((), bool), state, problem, scaling, data)
-    return found._replace(infeasible=infeasible)
+def proven_by_active_set(
+    settings: RowSettings, found: Found, evidence: Evidence, data: RowData
+) -> Array:
+    """Whether what the active set claims of an unsolved problem is proven."""
+    state, problem, scaling = evidence
+    claimed = state.infeasible & proves_infeasible(problem, farkas(problem, state))
+    contradicted = contradicts(scaling, data.C, data.low, data.high, settings.tolerance)
+    return found.usable & (claimed | contradicted)
 
 
 def by_interior_point(

@@ -30,6 +30,8 @@ from kjax.qp.problem import Status, no_tangent
 from kjax.qp.row_derivative import active_equations
 from kjax.qp.row_methods import (
     ROW_METHODS,
+    Evidence,
+    Found,
     RowData,
     RowMethod,
     RowSettings,
@@ -38,6 +40,7 @@ from kjax.qp.row_methods import (
     by_interior_point,
     by_splitting,
     classified,
+    proven_by_active_set,
 )
 from kjax.qp.row_problem import scale_rows
 
@@ -173,29 +176,20 @@ def _solve(
     by_curvature = settings.method in ("auto", "active_set")
     problem, scaling = scale_rows(*data[:5], equilibrate=not by_curvature)
     inner = settings._replace(tolerance=tolerance)
+    evidence = None
     if settings.method == "interior_point":  # step 2
         found = by_interior_point(inner, problem, scaling, data)
     elif settings.method == "admm":
         found = by_splitting(inner, problem, scaling, data, warm)
     else:
-        found = by_active_set(inner, problem, scaling, data)
-    if settings.method == "auto":
-        defeated = ~found.solved(tolerance) & (found.iterations < settings.max_iterations)
-        found = where_needed(
-            data.good & (~found.usable | (defeated & ~found.infeasible)),
-            partial(better_by_interior_point, inner),
-            found,
-            data,
-        )
+        found, evidence = by_active_set(inner, problem, scaling, data)
+    # One branch for all that an unsolved problem needs: each costs a call more than a microsecond.
+    solved_at_once = found.usable & found.solved(tolerance)
+    verdict = Verdict(jnp.zeros((), bool), jnp.zeros((), bool), found.x)
+    found, verdict = where_needed(
+        data.good & ~solved_at_once, partial(_unsolved, inner), (found, verdict), data, evidence
+    )
     solved = found.solved(tolerance)
-    verdict = Verdict(found.infeasible, jnp.zeros((), bool), found.x)
-    if settings.method != "active_set":  # step 4; it proves infeasibility as it goes
-        verdict = where_needed(
-            data.good & found.usable & ~solved & ~found.infeasible,
-            partial(classified, tolerance),
-            verdict,
-            data,
-        )
     status = jnp.select(
         [
             ~finite,
@@ -236,3 +230,30 @@ def _solve(
         iterations=found.iterations,
         method=found.method,
     )
+
+
+def _unsolved(
+    settings: RowSettings, old: tuple[Found, Verdict], data: RowData, evidence: Evidence | None
+) -> tuple[Found, Verdict]:
+    """Another method for what ``"auto"`` has not solved, then step 4."""
+    found, verdict = old
+    infeasible = found.infeasible
+    if evidence is not None:
+        infeasible = proven_by_active_set(settings, found, evidence, data)
+    if settings.method == "auto":
+        defeated = found.iterations < settings.max_iterations
+        found = where_needed(
+            ~found.usable | (defeated & ~infeasible),
+            partial(better_by_interior_point, settings),
+            found,
+            data,
+        )
+    verdict = verdict._replace(infeasible=infeasible)
+    if settings.method != "active_set":
+        verdict = where_needed(
+            found.usable & ~found.solved(settings.tolerance) & ~infeasible,
+            partial(classified, settings.tolerance),
+            verdict,
+            data,
+        )
+    return found, verdict

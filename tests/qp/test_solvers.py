@@ -46,7 +46,8 @@ def independent_residual(H, q, lower, upper, x):
     rounding = 4 * np.sqrt(len(q)) * np.finfo(float).eps
     noise = rounding * max(np.abs(d * q).max(), np.abs(x / d).max())
     excess = np.maximum(np.abs(gradient) - noise, 0.0)
-    ratio = np.divide(excess, own, out=np.zeros_like(own), where=own > 0)
+    with np.errstate(over="ignore"):  # what is far off may be infinitely far off
+        ratio = np.divide(excess, own, out=np.zeros_like(own), where=own > 0)
     return np.where(held, 0.0, ratio).max()
 
 
