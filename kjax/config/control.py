@@ -44,7 +44,7 @@ class LmpcConfig:
     """Length of the prediction, in steps of model_dt [-]."""
     state_weights: tuple[
         NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
-    ] = (2000.0, 3e4, 1200.0, 12.0, 3.0, 0.08)
+    ] = (2000.0, 3e4, 1200.0, 12.0, 3.0, 0.2)
     """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
     input_weight: Positive = 1e-5
     """R of every force [1/N^2]."""
