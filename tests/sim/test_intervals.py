@@ -49,6 +49,12 @@ def pairs(both, only_first, only_second, neither):
     return first, second
 
 
+def test_the_difference_of_paired_shares_is_that_of_a_published_table():
+    """Bentur 2009 in Fagerland et al., BMC Med. Res. Meth. 13:91: 1, 1, 7, 12 of 21."""
+    difference, low, high = paired_difference(*pairs(1, 1, 7, 12)[::-1])
+    assert (difference, low, high) == pytest.approx((-0.286, -0.507, -0.026), abs=6e-4)
+
+
 def test_the_difference_of_paired_shares_is_newcombe_s_published_example():
     """Altman et al., Statistics with Confidence: 20, 12, 2, 16 of 50 give 0.20 (0.056 to 0.329)."""
     first, second = pairs(20, 12, 2, 16)
