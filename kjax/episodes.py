@@ -9,7 +9,9 @@ import hashlib
 import itertools
 import json
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
@@ -235,14 +237,23 @@ _call: Any = None  # in a worker: the number of the parent's present call
 
 
 def _begin_worker(workers: Any, call: Any) -> None:
-    """Give a worker process a core of its own, and leave Ctrl-C to its parent."""
+    """Give a worker process a core of its own, and leave Ctrl-C to its parent; end with it."""
     global _call
     _call = call
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with workers.get_lock():
         number = workers.value
         workers.value += 1
     cli.configure_jax(one_core=True, core=number)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent was killed: it would wait for tasks for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # a worker has one
+    parent.join()
+    os._exit(1)
 
 
 def _episode_of_call(

@@ -2,6 +2,12 @@
 
 import dataclasses
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -240,3 +246,44 @@ def test_a_config_that_needs_another_simulation_is_refused(config, simulation):
     with pytest.raises(ValueError, match="fixed_part"):
         simulate(simulation, dataclasses.replace(config, bound=dataclasses.replace(
             config.bound, apex=0.1)))  # fmt: skip
+
+
+PARENT = """
+import multiprocessing, os, signal
+from concurrent.futures import ProcessPoolExecutor
+from kjax import episodes
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    shared = context.Value("i", 0), context.RawValue("i", 0)
+    pool = ProcessPoolExecutor(1, context, initializer=episodes._begin_worker, initargs=shared)
+    print(pool.submit(os.getpid).result(), flush=True)
+    signal.pause()
+"""
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path, repository):
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT, encoding="utf-8")
+    env = {**os.environ, "PYTHONPATH": str(repository)}
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True, env=env)
+    worker = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 30.0
+    while time.monotonic() < deadline and is_alive(worker):
+        time.sleep(0.05)
+    ended = not is_alive(worker)
+    if not ended:
+        os.kill(worker, signal.SIGKILL)
+    assert ended
+
+
+def is_alive(process):
+    """Whether it runs; one that nobody has waited for yet is no more."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{process}/stat")
+    return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")

@@ -1,20 +1,36 @@
-"""What the README shows is run as written."""
+"""What the README and the pages in docs/ show is run as written."""
 
 import re
 
 import jax
 import mujoco
 import numpy as np
+import pytest
 
 from kjax.config import SimConfig
 from kjax.robots import go1
 from kjax.sim.observe import resolve
 from kjax.sim.scene import build_model
 
+PAGES = ("README.md", *(f"docs/{name}.md" for name in (
+    "results", "your_own_loop", "sweeps", "qp", "models", "tuning",
+)))  # fmt: skip
 
-def blocks(repository, language):
-    text = (repository / "README.md").read_text(encoding="utf-8")
+
+def blocks(repository, page, language):
+    text = (repository / page).read_text(encoding="utf-8")
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+def test_every_page_of_the_docs_is_looked_at(repository):
+    found = {path.relative_to(repository).as_posix() for path in (repository / "docs").glob("*.md")}
+    assert found == set(PAGES[1:])
+
+
+def test_the_readme_fits_on_a_few_screens(repository):
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    assert len(text.encode()) <= 8000
 
 
 def test_the_controller_examples_walk_somebody_elses_robot(repository):
@@ -22,7 +38,8 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
 
     The ground is not at zero, and the robot looks the other way.
     """
-    with_loop, bare, _, _ = blocks(repository, "python")
+    with_loop, bare = blocks(repository, "docs/your_own_loop.md", "python")
+    assert blocks(repository, "README.md", "python") == [with_loop]
     floor = -0.27
     model = build_model(SimConfig(floor=floor))
     at = resolve(model)
@@ -71,7 +88,7 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
 
 
 def test_the_qp_example_runs_in_the_precision_that_a_reader_has(repository):
-    _, _, code, _ = blocks(repository, "python")
+    (code,) = blocks(repository, "docs/qp.md", "python")
     scope = {}
     with jax.enable_x64(False):
         exec(code, scope)
@@ -83,7 +100,7 @@ def test_the_qp_example_runs_in_the_precision_that_a_reader_has(repository):
 
 
 def test_the_models_example_runs(repository):
-    *_, code = blocks(repository, "python")
+    (code,) = blocks(repository, "docs/models.md", "python")
     scope = {}
     exec(code, scope)
     assert scope["predicted"].shape == (41, 6)
@@ -92,8 +109,9 @@ def test_the_models_example_runs(repository):
     assert np.isfinite(scope["predicted"]).all()
 
 
-def test_the_commands_name_files_and_keys_that_exist(repository):
-    text = "\n".join(blocks(repository, "bash"))
+@pytest.mark.parametrize("page", PAGES)
+def test_the_commands_name_files_and_keys_that_exist(page, repository):
+    text = "\n".join(blocks(repository, page, "bash"))
     for path in re.findall(r"(?:experiments|configs)/\w+\.\w+", text):
         assert (repository / path).is_file(), path
     targets = (repository / "Makefile").read_text()
@@ -101,7 +119,8 @@ def test_the_commands_name_files_and_keys_that_exist(repository):
         assert f"\n{target}: " in targets, target
 
 
-def test_pictures_of_the_readme_are_in_the_repository(repository):
-    text = (repository / "README.md").read_text(encoding="utf-8")
-    for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
-        assert (repository / path).is_file(), path
+@pytest.mark.parametrize("page", PAGES)
+def test_pictures_and_pages_that_are_linked_are_in_the_repository(page, repository):
+    text = (repository / page).read_text(encoding="utf-8")
+    for path in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert ((repository / page).parent / path).is_file(), path
