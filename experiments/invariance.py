@@ -140,7 +140,7 @@ def _parse(argv: Sequence[str] | None) -> Namespace:
     parser.add_argument("--checks", nargs="+", choices=tuple(LIMITS), default=list(LIMITS))
     parser.add_argument("--residual", type=Path, metavar="FILE", help="a residual of "
                         "whole_body.py: walk with it in trot as well")  # fmt: skip
-    parser.add_argument("--learned", type=Path, metavar="FILE", help="a model of koopman_study.py: "
+    parser.add_argument("--learned", type=Path, metavar="FILE", help="a model of learn_control.py: "
                         "walk with it as well")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=16, help="of the bound in float64")
     parser.add_argument("--threads", type=int, default=None, help="one per core by default")

@@ -120,6 +120,11 @@ def test_the_commands_name_files_and_keys_that_exist(page, repository):
 
 
 @pytest.mark.parametrize("page", PAGES)
+def test_nothing_is_left_to_be_filled_in(page, repository):
+    assert not re.search(r"@@|TODO|TBD", (repository / page).read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_pictures_and_pages_that_are_linked_are_in_the_repository(page, repository):
     text = (repository / page).read_text(encoding="utf-8")
     for path in re.findall(r"\]\(([^)#:]+)\)", text):

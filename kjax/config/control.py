@@ -202,7 +202,7 @@ class MultiPhaseConfig:
     tolerance: Positive = 1e-6
     """Relative residuals and gap at which the QP counts as solved [-]."""
     max_iterations: Count = 30
-    """Iteration limit of the interior point [-]."""
+    """Iteration limit of the QP [-]."""
 
     @model_validator(mode="after")
     def _check(self) -> "MultiPhaseConfig":

@@ -67,10 +67,10 @@ class KoopmanConfig:
     model: Literal[
         "linear", "srb_hover", "srb", "planted", "exact", "bilinear", "residual", "learned"
     ] = "linear"
-    """Kind of prediction model, see kjax.koopman.families; the paper's is linear. All but it are
-    linearised at every tick where the robot is [-]."""
+    """Kind of prediction model, see kjax.koopman.families; the paper's is linear. All but it
+    and srb_hover are linearised at every tick where the robot is [-]."""
     file: str = ""
-    """Numbers of the model, written by koopman_study.py; needed by residual and learned [-]."""
+    """Fitted model (.npz): of whole_body.py for residual, of learn_control.py for learned [-]."""
     dictionary: Literal["paper", "paper_literal", "monomials", "fourier"] = "paper"
     """The paper's dictionary without its duplicate columns, or letter by letter; or products of
     states; or random Fourier features [-]."""

@@ -103,7 +103,7 @@ class SimConfig:
     """Physics."""
 
     sim_dt: Positive = 0.001
-    """Physics step; torques are recomputed at each [s]."""
+    """Physics step; leg.act_dt is a multiple of it [s]."""
     base: Literal["free", "planar"] = "free"
     """A free trunk, or one on two slides and a pitch hinge (the paper); the controller is built for
     either [-]."""
