@@ -87,7 +87,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
     hessians_stay = config.koopman.feet == "fixed" and config.koopman.model == "linear"
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
-        if is_concrete(observation):
+        if is_concrete((observation, params.robot)):
             check_observation(params.robot, observation)
         observation = cast(observation, params.position_slack.dtype)
         # The heading of a first sample that is no good is taken from the first good one.

@@ -91,6 +91,21 @@ def test_another_rate_than_the_controllers_is_told_once():
     assert told == []
 
 
+def test_a_flag_that_is_no_number_does_not_stop_a_walk():
+    loop = loop_of(Stub())
+    loop.step(sample(), 0.0)
+    assert loop.step(sample(contact=np.array([1.0, np.nan, 1.0, 1.0])), 0.001).shape == (4, 3)
+
+
+def test_a_first_call_that_compiles_and_a_pause_are_no_rate():
+    loop = loop_of(Stub())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for time in [0.0, *(6.0 + 0.001 * np.arange(40)), *(9.0 + 0.001 * np.arange(40))]:
+            loop.step(sample(), time)
+    assert told == []
+
+
 def test_a_jittering_clock_is_not_complained_of():
     loop, rng = loop_of(Stub()), np.random.default_rng(0)
     times = np.cumsum(0.001 * rng.uniform(0.5, 1.5, 200))

@@ -190,3 +190,18 @@ def test_the_heading_to_keep_is_that_of_the_first_valid_sample(free, params):
     np.testing.assert_allclose(state.track, ours.track, rtol=0, atol=1e-12)
     again, _ = free.plan(params, state, seen_from(good, 0.3, (0.0, 0.0)))
     np.testing.assert_array_equal(again.track, state.track)
+
+
+def test_the_gradient_through_act_is_finite_on_the_free_base(params):
+    """Swing legs press with nothing, where a root has no derivative."""
+    controller = build_controller(FREE)
+    seen = disturbed(0)
+    state, _ = controller.plan(params, controller.init(params, seen), seen)
+
+    def cost(params, seen):
+        return jnp.sum(controller.act(params, state, seen)[1] ** 2)
+
+    slopes = jax.jit(jax.grad(cost, (0, 1), allow_int=True))(params, seen)
+    for leaf in jax.tree.leaves(slopes):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            assert np.isfinite(leaf).all()

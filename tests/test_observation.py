@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from kjax import Observation, build_controller, build_params, check_observation, load_config, qp
 from kjax.config import RunConfig
-from kjax.observation import SHAPES, is_valid
+from kjax.observation import SHAPES, cast, is_valid
 from kjax.robots import go1
 
 CONFIG = load_config(RunConfig, None, {"lmpc.horizon": 2, "koopman.order": 1})
@@ -133,8 +133,49 @@ USELESS = {
     "base_ang_vel": [np.full(3, 1e30)],
     "joint_pos": [np.full((4, 3), 1e308), np.full((4, 3), 100.0)],
     "joint_vel": [np.full((4, 3), -1e200)],
-    "base_pos": [np.full(3, np.nan)],
 }
+
+
+def test_a_position_that_is_no_number_is_not_missed(params, calls):
+    """The controller does not read it: an odometry that drops out must not stop the robot."""
+    init, plan, act = calls
+    good = standing()
+    state = init(params, good)
+    lost = good._replace(base_pos=np.full(3, np.nan))
+    for seen in (lost, good):
+        _, info = plan(params, state, seen)
+        assert int(info.status) == qp.Status.SOLVED
+        assert float(info.blind_time) == 0.0
+    np.testing.assert_array_equal(act(params, state, lost)[1], act(params, state, good)[1])
+
+
+def test_a_contact_flag_that_is_no_number_is_off():
+    seen = cast(standing(contact=np.array([1.0, np.nan, 0.0, 2.0])), float)
+    np.testing.assert_array_equal(seen.contact, [True, False, False, True])
+
+
+def test_lists_are_as_good_as_arrays(params):
+    controller = build_controller(CONFIG)
+    lists = Observation(*(np.asarray(field).tolist() for field in standing()))
+    first, second = (controller.init(params, seen) for seen in (lists, standing()))
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    assert not bool(is_valid(jax.tree.map(jnp.asarray, standing(base_vel=np.full(3, np.nan)))))
+
+
+def test_init_takes_a_constant_sample_inside_a_trace(params):
+    """Domain randomisation: one sample for many robots."""
+    controller, good = build_controller(CONFIG), standing()
+    eager = controller.init(params, good)
+    inside = jax.jit(lambda: controller.init(params, good))()
+    given = jax.jit(lambda params: controller.init(params, good))(params)
+    for state in (inside, given):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-12), state, eager
+        )
+    masses = jnp.stack([params.robot.mass, 1.1 * params.robot.mass])
+    many = jax.vmap(lambda m: controller.init(
+        params._replace(robot=params.robot._replace(mass=m)), good))(masses)  # fmt: skip
+    assert many.ground.shape[0] == 2
 
 
 @pytest.mark.parametrize("name", USELESS)

@@ -127,6 +127,8 @@ def resolve(path: str | Path) -> Path:
 
 def _with_suffix(path: str | Path) -> Path:
     path = Path(path)
+    if not path.name:
+        raise _fault(path, "is no file")
     return path if path.name.endswith(_SUFFIX) else path.with_name(path.name + _SUFFIX)
 
 

@@ -101,9 +101,11 @@ def distribute(
     force = planned + change.reshape(4, 3) * stance[:, None]
     z = jnp.maximum(force[:, 2], 0.0)
     # Of a pair that slides, one foot lets go first, and the trunk rolls.
-    level = jnp.sqrt(force[:, 0] ** 2 + force[:, 1] ** 2)
+    square = force[:, 0] ** 2 + force[:, 1] ** 2
     limit = params.friction * z
-    inside = jnp.where(level > limit, limit / jnp.where(level > limit, level, 1.0), 1.0)
+    slides = square > limit**2
+    # No root of 0, whose derivative is infinite.
+    inside = jnp.where(slides, limit / jnp.sqrt(jnp.where(slides, square, 1.0)), 1.0)
     return jnp.stack([force[:, 0] * inside, force[:, 1] * inside, z], axis=-1)
 
 

@@ -120,8 +120,11 @@ def scale_rows(
     # Fixed variables leave: their columns act through q and the rows' bounds.
     linear = jnp.where(free, q + H @ at, 0.0) * d
     C_free = C * d * free
-    length = jnp.linalg.norm(C_free, axis=1)
-    immovable = length == 0
+    # Measured by the largest entry: the squares of very small or large ones are 0 or infinite.
+    largest = jnp.max(jnp.abs(C_free), axis=1)
+    immovable = largest == 0
+    largest = jnp.where(immovable, 1.0, largest)
+    length = largest * jnp.linalg.norm(C_free / largest[:, None], axis=1)
     length = jnp.where(immovable, 1.0, length)
     shift = jnp.concatenate([C @ at, at])
     off = jnp.concatenate([immovable, fixed])

@@ -207,3 +207,9 @@ def test_an_array_that_does_not_fit_a_learned_model_is_named(tmp_path, change, s
     arrays = {**np.load(path), **change}
     np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
     assert said in refusal(path, "learned")
+
+
+@pytest.mark.parametrize("name", [".", "/"])
+def test_a_path_without_a_name_is_no_file(name):
+    with pytest.raises(ConfigError, match=r"koopman\.file: .* is no file"):
+        storage.load(name, "residual")

@@ -90,6 +90,32 @@ def test_feet_do_not_pull_and_stay_within_the_friction_limit():
     assert (np.abs(level - limit)[limit > 0] < 1e-12).any()
 
 
+def test_derivatives_are_finite_with_feet_that_press_nothing_and_agree_with_differences():
+    wrench = jnp.asarray(wrench_of(PLANNED) + np.array([1.0, 8.0, 4.0, 3.0, -2.0, 1.5]))
+    planned = jnp.asarray(PLANNED * TROT[:, None])
+
+    def total(wrench, planned):
+        force = lateral.distribute(
+            settings(), jnp.asarray(ARMS), jnp.asarray(TROT), planned, wrench
+        )
+        return jnp.sum(force**2)
+
+    for argument, values in enumerate((wrench, planned)):
+        slope = np.asarray(jax.grad(total, argument)(wrench, planned))
+        assert np.isfinite(slope).all()
+        for index in ((1,), (4,)) if argument == 0 else ((0, 0), (3, 2)):
+            step = np.zeros(values.shape)
+            step[index] = 1e-5
+            ends = [
+                total(wrench + s * step, planned)
+                if argument == 0
+                else total(wrench, planned + s * step)
+                for s in (1, -1)
+            ]
+            wanted = float(ends[0] - ends[1]) / 2e-5
+            np.testing.assert_allclose(slope[index], wanted, rtol=1e-6, atol=1e-6)
+
+
 def test_no_foot_on_the_ground_gives_no_force(dtype):
     force = distribute(
         settings(dtype),

@@ -244,3 +244,17 @@ def test_at_the_tip_of_all_friction_cones_the_answer_is_no_force(dtype, method):
     solution = solve(H, q, C, *rows, *box, method=method)
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, 0.0, atol=1e-4 if dtype == "float32" else 1e-10)
+
+
+@pytest.mark.parametrize("unit", [1e-21, 1e20, 1e-165, 1e160])
+def test_the_unit_of_a_row_changes_nothing_however_small_or_large(unit, method):
+    """Squares of its entries are 0 or infinite."""
+    dtype = "float32" if 1e-30 < unit < 1e30 else "float64"
+    C, bound = np.full((1, 2), unit, dtype), np.array([unit], dtype)
+    box = np.full(2, -5.0, dtype), np.full(2, 5.0, dtype)
+    solution = solve(
+        np.eye(2, dtype=dtype), np.zeros(2, dtype), C, bound, np.array([INF], dtype), *box,
+        method=method,
+    )  # fmt: skip
+    assert solution.status == Status.SOLVED
+    np.testing.assert_allclose(solution.x, 0.5, atol=1e-4 if dtype == "float32" else 1e-8)
