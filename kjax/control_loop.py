@@ -17,8 +17,8 @@ from kjax.params import ControllerParams
 from kjax.state import ControllerState, PlanInfo
 from kjax.types import Observation
 
-PERIOD_TOLERANCE = 0.2  # relative error of the mean period that is told
-PERIOD_CALLS = 20  # calls that the mean is taken over
+PERIOD_TOLERANCE = 0.2  # relative error of the period that is told
+PERIOD_CALLS = 100  # calls that the period is taken over
 
 
 class ControlLoop:
@@ -64,7 +64,7 @@ class ControlLoop:
             convention (``observation.check_observation``), and a time that does not run on.
 
         Warns:
-          UserWarning: once, if the median time between calls is not the controller's ``act_dt``.
+          UserWarning: once, if the time between calls is not the controller's ``act_dt``.
         """
         check_shapes(observation)
         if not np.isfinite(time) or time <= self._last:
@@ -90,10 +90,15 @@ class ControlLoop:
         """Tell once of another period than the legs' paths are timed for."""
         if self._told:
             return
-        self._periods = [*self._periods[1 - PERIOD_CALLS :], period]
-        # The median: the first call compiles, and a pause is no rate.
-        period, wanted = float(np.median(self._periods)), self._controller.act_dt
-        if len(self._periods) < PERIOD_CALLS or abs(period / wanted - 1.0) <= PERIOD_TOLERANCE:
+        self._periods.append(period)
+        if len(self._periods) < PERIOD_CALLS:
+            return
+        # Without the extremes: the first call compiles, and a pause is no rate.
+        tenth = PERIOD_CALLS // 10
+        period = float(np.mean(np.sort(self._periods)[tenth:-tenth]))
+        wanted = self._controller.act_dt
+        self._periods = []
+        if abs(period / wanted - 1.0) <= PERIOD_TOLERANCE:
             return
         self._told = True
         warnings.warn(
