@@ -7,29 +7,28 @@ rounds of ours in between. Everything runs on one core with one thread.
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from edmd_data import PAPER, Setting, numpy_draw, numpy_loop, numpy_rollouts, sampler, setting
+from edmd_stream import STREAM, stream
 from tqdm import tqdm
 
-from kjax import cli, srb
-from kjax.config import KoopmanConfig, SrbConfig
+from kjax import cli
+from kjax.config import KoopmanConfig
 from kjax.koopman import edmd, models, observables, regression
-from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
-from kjax.rigid_body import own_body
-from kjax.robots import go1
-from kjax.types import GRAVITY, MODE_ALPHA, STATE_NAMES, Mode
+from kjax.koopman.dataset import Snapshots
+from kjax.types import STATE_NAMES
 
 PEERS = ("pykoopman", "pykoop")
 SCRIPT = Path(__file__).with_name("edmd_peers.py")
@@ -41,7 +40,6 @@ SEEDS = 10
 # (order, with the constant rotation): the paper's first, all of them cuts of the largest.
 DICTIONARIES = tuple((order, constant) for order in (4, 3, 2, 1, 0) for constant in (False, True))
 LARGEST = observables.paper(4, constant_rotation=True)
-PAPER = observables.paper(4)
 
 KEYS = ("fit_ms", "regression_ms", "many_s", "many_lifted_s")
 
@@ -50,20 +48,6 @@ VELOCITIES = slice(3, 6)
 
 ROLLOUTS = 10_000  # whose generation is timed
 LOOP = 20  # of them in the loop over rollouts and steps; the rest by proportion
-
-STREAM = 10_000_000  # snapshots
-BLOCK = 500  # of them in one QR
-
-
-class Setting(NamedTuple):
-    """What the data is drawn from: the trot of the Go1's rigid body in the default ranges."""
-
-    body: srb.SrbParams
-    alpha: jax.Array
-    ranges: SampleRanges
-    rollouts: int
-    steps: int
-    dt: float
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -117,28 +101,6 @@ def summary(result: dict[str, Any]) -> dict[str, Any]:
         "rollouts_over_vectorised_numpy": data["kjax"] / data["numpy_vectorised"],
         "streaming_snapshots_per_s": result["stream"]["snapshots_per_s"],
     }
-
-
-def setting() -> Setting:
-    """Trot, Go1, and the ranges that the controller's models are fitted on."""
-    config, body = KoopmanConfig().dataset, own_body(SrbConfig(), go1.PARAMS)
-    return Setting(
-        body=jax.tree.map(lambda leaf: leaf[Mode.TROT], edmd.srb_params(body)),
-        alpha=jnp.asarray(MODE_ALPHA[Mode.TROT], float),
-        ranges=ranges_from_config(config, vary_feet=False),
-        rollouts=config.rollouts,
-        steps=round(config.duration / config.dt),
-        dt=config.dt,
-    )
-
-
-def sampler(here: Setting, rollouts: int, steps: int) -> Callable[[jax.Array], Snapshots]:
-    """Compiled draw of rollouts from a random key."""
-    return jax.jit(
-        lambda key: sample(
-            key, here.body, here.alpha, here.ranges, rollouts=rollouts, steps=steps, dt=here.dt
-        )
-    )
 
 
 def _one_thread() -> None:
@@ -296,147 +258,6 @@ def rollouts(here: Setting, count: int, looped: int) -> dict[str, float]:
             if round_:
                 times[name].append(spent / number)
     return {name: 1.0 / float(np.median(values)) for name, values in times.items()}
-
-
-def numpy_draw(rng: np.random.Generator, here: Setting, count: int) -> tuple[np.ndarray, ...]:
-    """Initial states (count, 6) and forces (count, steps, 4) in the ranges of the setting."""
-    ranges = jax.tree.map(np.asarray, here.ranges)
-    x0 = ranges.state_centre + ranges.state_half * rng.uniform(-1.0, 1.0, (count, 6))
-    return x0, rng.uniform(ranges.input_low, ranges.input_high, (count, here.steps, 4))
-
-
-def numpy_rollouts(
-    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
-) -> np.ndarray:
-    """Trajectories (rollouts, steps + 1, 6): all rollouts at once, by Runge-Kutta.
-
-    As fast as plain NumPy has it: states in rows, what the step does not change taken once.
-    """
-    states = np.empty((inputs.shape[1] + 1, 6, len(x0)))
-    states[0] = x0.T
-    forces = np.ascontiguousarray(inputs.transpose(1, 2, 0)) * np.repeat(alpha, 2)[:, None]
-    for t, (x_front, z_front, x_rear, z_rear) in enumerate(forces):
-        force_x, force_z = (x_front + x_rear) / body.mass, (z_front + z_rear) / body.mass
-        (x_f, z_f), (x_r, z_r) = body.feet
-        moment = x_f * z_front - z_f * x_front + x_r * z_rear - z_r * x_rear
-        turn = moment / body.inertia
-        derivative = partial(_derivative, force_x, force_z, turn)
-        states[t + 1] = _rk4(derivative, states[t], dt)
-    return states.transpose(2, 0, 1)
-
-
-def _rk4(derivative: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: float) -> np.ndarray:
-    k1 = derivative(x)
-    k2 = derivative(x + 0.5 * dt * k1)
-    k3 = derivative(x + 0.5 * dt * k2)
-    k4 = derivative(x + dt * k3)
-    return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-
-
-def _derivative(
-    force_x: np.ndarray, force_z: np.ndarray, turn: np.ndarray, x: np.ndarray
-) -> np.ndarray:
-    """Derivative (6, rollouts); forces per mass [m/s^2] in the body frame, turn [rad/s^2]."""
-    out = np.empty_like(x)
-    c, s = np.cos(x[2]), np.sin(x[2])
-    out[:3] = x[3:]
-    out[3] = c * force_x - s * force_z
-    out[4] = s * force_x + c * force_z - GRAVITY
-    out[5] = turn
-    return out
-
-
-def numpy_loop(
-    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
-) -> np.ndarray:
-    """The same, one rollout and one step after the other."""
-    states = np.empty((len(x0), inputs.shape[1] + 1, 6))
-    states[:, 0] = x0
-    for path, forces in zip(states, inputs, strict=True):
-        for t, u in enumerate(forces):
-            force = alpha[:, None] * u.reshape(2, 2)
-            total = force.sum(axis=0) / body.mass
-            arm = body.feet
-            moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum()
-            derivative = partial(_derivative, total[0], total[1], moment / body.inertia)
-            path[t + 1] = _rk4(derivative, path[t], dt)
-    return states
-
-
-# ---------------------------------------------------------------- stream
-
-
-def stream(here: Setting, total: int) -> dict[str, float]:
-    """Snapshots through the triangle, drawn as they are needed and forgotten; none is kept.
-
-    Returns:
-      Snapshots per second into the triangle (lifting included), and with their drawing; peak
-      memory over that before the first one [MB], compiled programs included, and growth after the
-      first hundredth [MB]; what all rows would take [MB]; the largest difference between the
-      coefficients of the first blocks and of one factorisation of the same rows, relative to the
-      largest coefficient, in scaled columns.
-    """
-    before = _resident()
-    draw, size = sampler(here, here.rollouts, here.steps), here.rollouts * here.steps
-    pushes = max(1, total // size)
-    kept: list[Snapshots] = []
-    triangle, part = empty_triangle(), empty_triangle()
-    jax.block_until_ready(push(triangle, draw(jax.random.key(1))))
-    pushing, drawing, early = 0.0, 0.0, 0.0
-    for i in tqdm(range(pushes), desc="stream", leave=False, disable=None):
-        clock = time.perf_counter()
-        data = jax.block_until_ready(draw(jax.random.fold_in(jax.random.key(0), i)))
-        middle = time.perf_counter()
-        triangle = jax.block_until_ready(push(triangle, data))
-        pushing += time.perf_counter() - middle
-        drawing += middle - clock
-        if i < 10:
-            kept.append(data)
-            part = triangle
-        if i == max(9, pushes // 100):
-            early = _resident()
-    peak = _resident()
-    columns = triangle.R.shape[0]
-    return {
-        "snapshots": pushes * size,
-        "snapshots_per_s": pushes * size / pushing,
-        "snapshots_per_s_with_drawing": pushes * size / (pushing + drawing),
-        "peak_MB": peak - before,
-        "growth_MB": peak - early,
-        "all_rows_MB": pushes * size * columns * triangle.R.dtype.itemsize / 1e6,
-        "coefficients_difference": difference_from_one_shot(part, kept),
-    }
-
-
-def empty_triangle() -> regression.Triangle:
-    """The triangle of the paper's dictionary and four forces, of no rows."""
-    return regression.empty(PAPER.size + 4, PAPER.size)
-
-
-@jax.jit
-def push(triangle: regression.Triangle, data: Snapshots) -> regression.Triangle:
-    """The triangle with the snapshots more, in blocks of ``BLOCK`` rows."""
-    Z, Y = edmd.regressors(PAPER, data)
-    whole = len(Z) // BLOCK * BLOCK
-    blocks = (a[:whole].reshape(-1, BLOCK, a.shape[1]) for a in (Z, Y))
-    triangle = regression.block_rows(triangle, *blocks)
-    return regression.accumulate(triangle, Z[whole:], Y[whole:]) if whole < len(Z) else triangle
-
-
-def difference_from_one_shot(triangle: regression.Triangle, data: Sequence[Snapshots]) -> float:
-    """Largest difference of the coefficients, relative to the largest, in scaled columns."""
-    together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *data)
-    columns = PAPER.size + 4
-    rows = jax.jit(lambda data: regression.of_rows(*edmd.regressors(PAPER, data)))(together)
-    solve = jax.jit(partial(regression.solve, columns=columns))
-    scale = np.linalg.norm(np.asarray(rows.R)[:, :columns], axis=0)[:, None]
-    wanted, found = (scale * np.asarray(solve(one).W) for one in (rows, triangle))
-    return float(np.abs(found - wanted).max() / np.abs(wanted).max())
-
-
-def _resident() -> float:
-    """Largest resident memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 # ---------------------------------------------------------------- presentation

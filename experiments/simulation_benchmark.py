@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib.pyplot as plt
 import mujoco.batch
 import numpy as np
+import simulation_report
 
 from kjax.config import RunConfig, load_config
 from kjax.sim.batch_loop import BatchEngine, dressed
@@ -63,8 +63,8 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         result["machine_two_process_speedup"] = machine_speedup()
         result |= two_processes(folder)
     result |= headline(result)
-    (folder / "table.md").write_text(table(result), encoding="utf-8")
-    figure(result, folder / "figure.png")
+    (folder / "table.md").write_text(simulation_report.table(result), encoding="utf-8")
+    simulation_report.figure(result, folder / "figure.png")
     return result
 
 
@@ -358,51 +358,3 @@ def _cores() -> list[int]:
 def _resident() -> float:
     """Largest resident memory of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-
-
-# ---------------------------------------------------------------- presentation
-
-
-def table(result: dict[str, Any]) -> str:
-    """All of it as Markdown."""
-    lines = [
-        "| engine, gait, torques, robots | robot-steps/s | bare engine | part of it | memory, MB |",
-        "|---|---|---|---|---|",
-    ]
-    rows = [(f"C, {name}", entry) for name, entry in result["c"].items()]
-    rows += [(f"MJX, trot, every_step, {name}", entry) for name, entry in result["mjx"].items()]
-    for name, entry in rows:
-        lines.append(
-            f"| {name} | {entry['robot_steps_per_s']:,.0f} | "
-            f"{entry['bare_robot_steps_per_s']:,.0f} | {entry['over_bare']:.2f} | "
-            f"{entry['resident_MB']:,.0f} |"
-        )
-    alone = result["python_loop"]["robot_steps_per_s"]
-    lines.append(f"| C, trot, every step, one robot in a Python loop | {alone:,.0f} | | | |")
-    return "\n".join(lines) + "\n"
-
-
-def figure(result: dict[str, Any], path: Path) -> None:
-    """Robot-steps per second against the number of robots."""
-    fig, ax = plt.subplots(figsize=(6, 4), layout="constrained")
-    for torques, color in (("held", "C0"), ("every_step", "C1")):
-        points = {
-            int(key.split(", ")[-1]): entry
-            for key, entry in result["c"].items()
-            if key.startswith(f"trot, {torques}")
-        }
-        for kind, style in (("robot_steps_per_s", "o-"), ("bare_robot_steps_per_s", ":")):
-            label = f"C, torques {torques.replace('_', ' ')}" + (", bare" if style == ":" else "")
-            ax.loglog(list(points), [e[kind] for e in points.values()], style, color=color,
-                      label=label)  # fmt: skip
-    points = {int(key): entry for key, entry in result["mjx"].items()}
-    for kind, style in (("robot_steps_per_s", "o-"), ("bare_robot_steps_per_s", ":")):
-        label = "MJX, every step" + (", bare" if style == ":" else "")
-        ax.loglog(list(points), [e[kind] for e in points.values()], style, color="C2", label=label)
-    alone = result["python_loop"]["robot_steps_per_s"]
-    ax.axhline(alone, color="0.5", lw=1, label="one robot in a Python loop")
-    ax.set(xlabel="robots", ylabel="robot-steps per second",
-           title=f"Flat trot, {result['threads']} threads")  # fmt: skip
-    ax.legend(fontsize=7, loc="center right")
-    fig.savefig(path, dpi=120)
-    plt.close(fig)

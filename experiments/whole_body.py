@@ -13,10 +13,8 @@ weights_<gait>.npz (all models). The recordings stay there as well and are used 
 with those of other configs or other code is refused.
 """
 
-import json
-import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +22,10 @@ import numpy as np
 import whole_body_report as report
 from prediction_models import MODELS as MODEL_KEYS
 from prediction_models import residual
+from whole_body_recordings import CONFIGS, DT, KINDS, kept, record
 
 from kjax import cli, srb
-from kjax.config import RunConfig, SrbConfig, load_config, to_dict
-from kjax.episodes import code_version
+from kjax.config import RunConfig, SrbConfig, load_config
 from kjax.koopman import open_loop, storage, whole_body
 from kjax.koopman.features import (
     Features,
@@ -38,33 +36,17 @@ from kjax.koopman.features import (
     touchdown,
 )
 from kjax.koopman.prediction import build_family
-from kjax.koopman.whole_body import Episode, Transitions
+from kjax.koopman.transitions import Episode, Transitions, split, transitions
 from kjax.params import fit_models
 from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import Mode
 
-CONFIGS = Path(__file__).parents[1] / "configs"
-DT = 0.005  # s, control tick of all these configs
 HORIZONS = {"25ms": 5, "50ms": 10}  # ticks
 HELD_OUT, TUNE = 0.3, 0.2 / 0.7  # of all episodes, of those left
 STEPS = (1, 5, 10)  # ticks that a row of the fit sums over, to choose from
 
 
-class Kind(NamedTuple):
-    """Episodes of one kind: config, range of commanded speeds [m/s], other keys."""
-
-    config: str
-    speeds: tuple[float, float]
-    keys: dict[str, Any]
-
-
-KINDS = {
-    "trot": Kind("trot_velocity_long.toml", (-0.1, 0.6), {"lmpc.command_slew": 1.0}),
-    "trot_rough": Kind("trot_rough.toml", (0.15, 0.4), {}),
-    "bound": Kind("bound_multiphase.toml", (-0.1, 0.8), {}),
-    "bound_rough": Kind("bound_rough.toml", (0.5, 0.8), {}),
-}
 GAITS = {"trot": ("trot", "trot_rough"), "bound": ("bound", "bound_rough")}
 MODELS: dict[str, Features] = {
     "affine": affine,
@@ -141,102 +123,6 @@ def main() -> None:
     print(f"\n{report.table(families)}\nresults in {folder}/")
 
 
-def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[RunConfig]:
-    """Configs of the robots of a kind: each its own speeds, and obstacles or pushes.
-
-    On flat ground every other robot is pushed.
-    """
-    chosen, configs = KINDS[kind], []
-    for seed in range(robots):
-        rng = np.random.default_rng([seed, 17])
-        times = [0.0, 1.0, *np.arange(3.0, duration, 2.0)]
-        keys = {
-            "seed": seed,
-            "duration": duration,
-            "sim.contacts": "feet",
-            "noise.force": force,
-            "command.times": times,
-            "command.velocities": [0.0, *rng.uniform(*chosen.speeds, len(times) - 1)],
-            **chosen.keys,
-        }
-        if kind.endswith("rough"):
-            keys["terrain.seed"] = seed
-        elif seed % 2:
-            early = np.arange(1.5, duration - 1.0, 2.0)
-            at = np.round(early + rng.uniform(0.0, 1.0, len(early)), 3)
-            keys["push.times"] = list(at)
-            keys["push.forward"] = list(rng.uniform(-4.0, 4.0, len(at)))
-        configs.append(load_config(RunConfig, CONFIGS / chosen.config, keys))
-    return configs
-
-
-def kept(kind: str, args: Any, folder: Path) -> dict[str, np.ndarray] | None:
-    """A kind's recording where it lies in the folder; ends the program where another one does."""
-    path = folder / f"episodes_{kind}.npz"
-    if not path.exists():
-        return None
-    try:
-        with np.load(path) as data:
-            arrays = dict(data)
-            held = str(arrays.pop("configs")), str(arrays.pop("code", "none"))
-    except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
-        cli.fail(f"{path}: damaged ({error}); remove it, and only it is recorded again")
-    if held != label(kind_configs(kind, args.robots, args.duration, args.force)):
-        cli.fail(
-            f"{path} holds episodes of another config or other code: give --out another folder, or "
-            "remove it"
-        )
-    return arrays
-
-
-def label(configs: list[RunConfig]) -> tuple[str, str]:
-    """What a recording comes from: configs and code."""
-    wanted = json.dumps([to_dict(config) for config in configs], sort_keys=True)
-    return wanted, code_version(Path(__file__))
-
-
-def record(kind: str, args: Any, folder: Path) -> list[Episode]:
-    """Episodes of a kind, from the folder where they lie there already."""
-    from kjax.sim.batch_loop import BatchEngine
-
-    there = kept(kind, args, folder)
-    if there is not None:
-        print(f"{kind}: {args.robots} episodes of {args.duration:g} s are there", flush=True)
-        return _episodes(there)
-    configs = kind_configs(kind, args.robots, args.duration, args.force)
-    path = folder / f"episodes_{kind}.npz"
-    print(f"{kind}: recording {args.robots} episodes of {args.duration:g} s ...", flush=True)
-    begin = time.perf_counter()
-    run = BatchEngine(configs[0], torques="held").run(configs)
-    if run.interrupted:
-        raise KeyboardInterrupt
-    log, steps = run.log, np.arange(len(run.log.x)) * DT
-    disturbed = np.zeros(log.stance.shape[:2], bool)
-    for robot, config in enumerate(configs):
-        for at in config.push.times:
-            # A tick that a push reaches into counts.
-            disturbed[:, robot] |= (steps > at - DT) & (steps < at + config.push.duration)
-    arrays = {
-        **{name: getattr(log, name) for name in ("x", "feet", "force", "stance", "foot_force")},
-        "disturbed": disturbed,
-        "ticks": run.ticks,
-        "fell": run.fell,
-    }
-    scratch = path.with_suffix(".part.npz")
-    wanted, code = label(configs)
-    np.savez_compressed(scratch, configs=wanted, code=code, **arrays)
-    scratch.replace(path)
-    print(f"  {run.fell.sum()} falls, {time.perf_counter() - begin:.0f} s", flush=True)
-    return _episodes(arrays)
-
-
-def _episodes(arrays: dict[str, np.ndarray]) -> list[Episode]:
-    return [
-        Episode(**{name: arrays[name][:count, robot] for name in Episode._fields})
-        for robot, count in enumerate(arrays["ticks"])
-    ]
-
-
 def study(
     gait: str, recordings: dict[str, list[Episode]], quick: bool
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, whole_body.Fit], Transitions]:
@@ -254,9 +140,9 @@ def study(
             subset[len(subset)] = "rough" if kind.endswith("rough") else flat
             episodes.append(episode)
     numbers = np.arange(len(episodes))
-    rest, told = whole_body.split(numbers, share=HELD_OUT)
-    train, tune = whole_body.split(rest, share=TUNE, seed=1)
-    data = whole_body.transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
+    rest, told = split(numbers, share=HELD_OUT)
+    train, tune = split(rest, share=TUNE, seed=1)
+    data = transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
     fitted, tuned, held = (data.rows(np.isin(data.episode, own)) for own in (train, tune, told))
     print(f"{gait}: {len(train)}, {len(tune)} and {len(told)} episodes to fit, choose and "
           f"report, {len(fitted.x)} rows to fit", flush=True)  # fmt: skip

@@ -23,6 +23,7 @@ from kjax import RunConfig, load_config, srb  # noqa: E402
 from kjax.config import SrbConfig  # noqa: E402
 from kjax.koopman import open_loop, whole_body  # noqa: E402
 from kjax.koopman.features import affine, clock_history  # noqa: E402
+from kjax.koopman.transitions import Episode, split, transitions  # noqa: E402
 from kjax.rigid_body import own_body  # noqa: E402
 from kjax.robots import go1  # noqa: E402
 from kjax.sim.batch_loop import BatchEngine  # noqa: E402
@@ -56,7 +57,7 @@ recording = BatchEngine(configs[0], torques="held").run(configs)
 print(f"{ROBOTS} episodes of 3 s, {int(recording.fell.sum())} falls, {recording.wall_time:.0f} s")
 log = recording.log
 episodes = [
-    whole_body.Episode(
+    Episode(
         x=log.x[:count, robot],
         feet=log.feet[:count, robot],
         force=log.force[:count, robot],
@@ -74,8 +75,8 @@ episodes = [
 # scheduled feet, and no others, touch the ground.
 
 # %%
-data = whole_body.transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
-train, test = whole_body.split(np.arange(ROBOTS), share=0.33)
+data = transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
+train, test = split(np.arange(ROBOTS), share=0.33)
 fitted, held = (data.rows(np.isin(data.episode, own)) for own in (train, test))
 config = own_body(SrbConfig(), go1.PARAMS)
 body = srb.SrbParams(jnp.asarray(config.mass), jnp.asarray(config.inertia), jnp.zeros((2, 2)))

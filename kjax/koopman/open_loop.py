@@ -21,7 +21,8 @@ from kjax import srb
 from kjax.koopman.families import Family, operating_point
 from kjax.koopman.features import Features, Moment, affine
 from kjax.koopman.models import rollout
-from kjax.koopman.whole_body import Transitions, planted, read, start_at
+from kjax.koopman.transitions import Transitions
+from kjax.koopman.whole_body import planted, read, start_at
 from kjax.types import MODE_ALPHA, STATE_DIM, Mode
 
 

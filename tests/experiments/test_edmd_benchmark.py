@@ -22,20 +22,30 @@ def benchmark(repository):
 
 
 @pytest.fixture(scope="module")
+def drawing(benchmark):
+    return importlib.import_module("edmd_data")
+
+
+@pytest.fixture(scope="module")
+def streaming(benchmark):
+    return importlib.import_module("edmd_stream")
+
+
+@pytest.fixture(scope="module")
 def peers(benchmark):
     return importlib.import_module("edmd_peers")
 
 
 @pytest.fixture(scope="module")
-def small(benchmark):
+def small(drawing):
     """The benchmark's setting with 14 rollouts of 50 steps: 700 snapshots, no multiple of 500."""
-    return benchmark.setting()._replace(rollouts=14, steps=50)
+    return drawing.setting()._replace(rollouts=14, steps=50)
 
 
 @pytest.fixture(scope="module")
-def data(benchmark, small):
+def data(drawing, small):
     """Three data sets of the small setting."""
-    draw = benchmark.sampler(small, small.rollouts, small.steps)
+    draw = drawing.sampler(small, small.rollouts, small.steps)
     return jax.lax.map(draw, jax.random.split(jax.random.key(0), 3))
 
 
@@ -65,21 +75,21 @@ class LeastSquares:
         return z[:, :6]
 
 
-def test_rollouts_in_numpy_are_those_of_kjax(benchmark, small):
+def test_rollouts_in_numpy_are_those_of_kjax(drawing, small):
     rng = np.random.default_rng(0)
-    x0, inputs = benchmark.numpy_draw(rng, small, 5)
+    x0, inputs = drawing.numpy_draw(rng, small, 5)
     alpha = np.array([2.0, 1.0])  # no symmetry that hides a swap of the ends
     roll = jax.vmap(lambda x, u: srb.rollout(small.body, jnp.asarray(alpha), x, u, small.dt))
     wanted = np.asarray(jax.jit(roll)(x0, inputs))
     body = jax.tree.map(np.asarray, small.body)
-    for rival in (benchmark.numpy_rollouts, benchmark.numpy_loop):
+    for rival in (drawing.numpy_rollouts, drawing.numpy_loop):
         found = rival(body, alpha, x0, inputs, small.dt)
         # 50 steps that round states of up to 3 (m, rad, m/s, rad/s) differently.
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
 
 
-def test_numpy_draws_from_the_ranges_of_kjax(benchmark, small):
-    x0, inputs = benchmark.numpy_draw(np.random.default_rng(0), small, 200)
+def test_numpy_draws_from_the_ranges_of_kjax(drawing, small):
+    x0, inputs = drawing.numpy_draw(np.random.default_rng(0), small, 200)
     ranges = small.ranges
     spread = (x0 - ranges.state_centre) / ranges.state_half
     part = (inputs - ranges.input_low) / (ranges.input_high - ranges.input_low)
@@ -105,19 +115,19 @@ def test_a_hundred_fits_in_one_call_are_single_fits_in_their_dictionaries(benchm
         np.testing.assert_allclose(models.B[i, j][use[j]], model.B, atol=1e-10)
 
 
-def test_a_stream_ends_in_the_coefficients_of_one_factorisation(benchmark, data):
-    triangle, sets = benchmark.empty_triangle(), []
+def test_a_stream_ends_in_the_coefficients_of_one_factorisation(streaming, data):
+    triangle, sets = streaming.empty_triangle(), []
     for i in range(3):
         sets.append(jax.tree.map(lambda leaf: leaf[i], data))
-        triangle = benchmark.push(triangle, sets[-1])
+        triangle = streaming.push(triangle, sets[-1])
     assert triangle.rows == 3 * 700  # the rest of 200 behind each block of 500 is in it
     # Rounding of some hundred rows times the condition of the columns.
-    assert benchmark.difference_from_one_shot(triangle, sets) < 1e-10
-    assert benchmark.difference_from_one_shot(triangle, sets[:2]) > 1e-6
+    assert streaming.difference_from_one_shot(triangle, sets) < 1e-10
+    assert streaming.difference_from_one_shot(triangle, sets[:2]) > 1e-6
 
 
-def test_the_stream_counts_its_snapshots(benchmark, small):
-    found = benchmark.stream(small, 2100)
+def test_the_stream_counts_its_snapshots(streaming, small):
+    found = streaming.stream(small, 2100)
     assert found["snapshots"] == 2100
     assert found["snapshots_per_s"] > found["snapshots_per_s_with_drawing"] > 0.0
     assert found["all_rows_MB"] == pytest.approx(2100 * (15 + 4 + 15) * 8 / 1e6)

@@ -20,7 +20,7 @@ MODELS = ("linear (the paper)", "SRB re-linearised")
 @pytest.fixture(scope="module")
 def scripts(repository):
     sys.path.insert(0, str(repository / "experiments"))
-    names = ("model_walks", "whole_body", "reproduce", "sweep")
+    names = ("model_walks", "whole_body_recordings", "reproduce", "sweep")
     yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
     sys.path.remove(str(repository / "experiments"))
 
@@ -143,7 +143,7 @@ def record(scripts, monkeypatch, tmp_path):
     def call(*, robots=3, kind="trot"):
         count.clear()
         args = SimpleNamespace(robots=robots, duration=3.0, force=15.0)
-        assert len(scripts.whole_body.record(kind, args, tmp_path)) == robots
+        assert len(scripts.whole_body_recordings.record(kind, args, tmp_path)) == robots
         return sum(count)
 
     return call
@@ -159,7 +159,7 @@ def test_recordings_of_other_code_are_refused_and_kept(
 ):
     record()
     before = (tmp_path / "episodes_trot.npz").read_bytes()
-    monkeypatch.setattr(scripts.whole_body, "code_version", lambda *files: "other")
+    monkeypatch.setattr(scripts.whole_body_recordings, "code_version", lambda *files: "other")
     assert "another config or other code" in refusal(capsys, record)
     assert (tmp_path / "episodes_trot.npz").read_bytes() == before
 

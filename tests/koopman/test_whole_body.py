@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from kjax.koopman import families, features, open_loop, storage, whole_body
-from kjax.koopman.whole_body import Episode
+from kjax.koopman.transitions import Episode, split, transitions
 from kjax.types import MODE_ALPHA, Mode
 
 DT, SOLE, PHASE = 5e-3, 0.02, 12  # s, m, ticks
@@ -83,7 +83,7 @@ def episodes(body, weights):
 
 @pytest.fixture(scope="module")
 def data(episodes):
-    return whole_body.transitions(episodes, dt=DT, sole=SOLE)
+    return transitions(episodes, dt=DT, sole=SOLE)
 
 
 def test_a_known_residual_is_recovered_to_rounding(data, body, weights):
@@ -185,7 +185,7 @@ def test_lost_early_and_slipping_contacts_are_marked(body, weights):
     feet[29:37, 3] += [0.01, 0.0]  # slips in tick 28, and stays there until it lifts
     touch[PHASE - 1, 1] = 50.0  # lands a tick early
     disturbed = np.arange(len(whole.x)) == 30
-    seen = whole_body.transitions(
+    seen = transitions(
         [whole._replace(feet=feet, foot_force=touch, disturbed=disturbed)], dt=DT, sole=SOLE
     )
     changes = {PHASE, 2 * PHASE, 3 * PHASE}  # where the sensors still show the feet before
@@ -215,7 +215,7 @@ def test_an_idle_end_gets_no_weight(body):
         foot_force=60.0 * front,
         disturbed=np.zeros(ticks, bool),
     )
-    seen = whole_body.transitions([episode], dt=DT, sole=SOLE)
+    seen = transitions([episode], dt=DT, sole=SOLE)
     assert not seen.u[:, 2:].any()
     fit = whole_body.fit(seen, body, dt=DT, features=features.history)
     #  1, theta, v, omega; then force, arm, moments and last force of the front end
@@ -225,14 +225,14 @@ def test_an_idle_end_gets_no_weight(body):
 
 
 def test_the_split_keeps_episodes_whole(data):
-    fit, out = whole_body.split(data.episode, share=0.3)
+    fit, out = split(data.episode, share=0.3)
     assert len(out) == 3
     assert sorted([*fit, *out]) == list(range(10))
-    np.testing.assert_array_equal(out, whole_body.split(data.episode, share=0.3)[1])
+    np.testing.assert_array_equal(out, split(data.episode, share=0.3)[1])
     with pytest.raises(ValueError, match="share must lie between 0 and 1"):
-        whole_body.split(data.episode, share=1.0)
+        split(data.episode, share=1.0)
     with pytest.raises(ValueError, match="leaves none to fit on"):
-        whole_body.split(np.array([4, 4]), share=0.5)
+        split(np.array([4, 4]), share=0.5)
 
 
 def test_a_schedule_carries_a_prediction_over_a_touchdown(data, body, weights):
@@ -279,11 +279,11 @@ def test_what_cannot_be_used_is_said(body, weights):
     one = walk(0, body, weights)
     still = one._replace(stance=np.ones_like(one.stance))
     with pytest.raises(ValueError, match="at least one whole phase"):
-        whole_body.transitions([still], dt=DT, sole=SOLE)
+        transitions([still], dt=DT, sole=SOLE)
     odd = np.array(one.stance)
     odd[3] = [True, False, False, False]
     with pytest.raises(ValueError, match=r"no contact mode has the legs \[0\]"):
-        whole_body.transitions([one._replace(stance=odd)], dt=DT, sole=SOLE)
+        transitions([one._replace(stance=odd)], dt=DT, sole=SOLE)
 
 
 @pytest.mark.slow

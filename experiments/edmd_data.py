@@ -1,0 +1,117 @@
+"""The data that benchmark.py edmd fits: drawn by kjax, and by NumPy beside it."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kjax import srb
+from kjax.config import KoopmanConfig, SrbConfig
+from kjax.koopman import edmd, observables
+from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
+from kjax.rigid_body import own_body
+from kjax.robots import go1
+from kjax.types import GRAVITY, MODE_ALPHA, Mode
+
+PAPER = observables.paper(4)
+
+
+class Setting(NamedTuple):
+    """What the data is drawn from: the trot of the Go1's rigid body in the default ranges."""
+
+    body: srb.SrbParams
+    alpha: jax.Array
+    ranges: SampleRanges
+    rollouts: int
+    steps: int
+    dt: float
+
+
+def setting() -> Setting:
+    """Trot, Go1, and the ranges that the controller's models are fitted on."""
+    config, body = KoopmanConfig().dataset, own_body(SrbConfig(), go1.PARAMS)
+    return Setting(
+        body=jax.tree.map(lambda leaf: leaf[Mode.TROT], edmd.srb_params(body)),
+        alpha=jnp.asarray(MODE_ALPHA[Mode.TROT], float),
+        ranges=ranges_from_config(config, vary_feet=False),
+        rollouts=config.rollouts,
+        steps=round(config.duration / config.dt),
+        dt=config.dt,
+    )
+
+
+def sampler(here: Setting, rollouts: int, steps: int) -> Callable[[jax.Array], Snapshots]:
+    """Compiled draw of rollouts from a random key."""
+    return jax.jit(
+        lambda key: sample(
+            key, here.body, here.alpha, here.ranges, rollouts=rollouts, steps=steps, dt=here.dt
+        )
+    )
+
+
+def numpy_draw(rng: np.random.Generator, here: Setting, count: int) -> tuple[np.ndarray, ...]:
+    """Initial states (count, 6) and forces (count, steps, 4) in the ranges of the setting."""
+    ranges = jax.tree.map(np.asarray, here.ranges)
+    x0 = ranges.state_centre + ranges.state_half * rng.uniform(-1.0, 1.0, (count, 6))
+    return x0, rng.uniform(ranges.input_low, ranges.input_high, (count, here.steps, 4))
+
+
+def numpy_rollouts(
+    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
+) -> np.ndarray:
+    """Trajectories (rollouts, steps + 1, 6): all rollouts at once, by Runge-Kutta.
+
+    As fast as plain NumPy has it: states in rows, what the step does not change taken once.
+    """
+    states = np.empty((inputs.shape[1] + 1, 6, len(x0)))
+    states[0] = x0.T
+    forces = np.ascontiguousarray(inputs.transpose(1, 2, 0)) * np.repeat(alpha, 2)[:, None]
+    for t, (x_front, z_front, x_rear, z_rear) in enumerate(forces):
+        force_x, force_z = (x_front + x_rear) / body.mass, (z_front + z_rear) / body.mass
+        (x_f, z_f), (x_r, z_r) = body.feet
+        moment = x_f * z_front - z_f * x_front + x_r * z_rear - z_r * x_rear
+        turn = moment / body.inertia
+        derivative = partial(_derivative, force_x, force_z, turn)
+        states[t + 1] = _rk4(derivative, states[t], dt)
+    return states.transpose(2, 0, 1)
+
+
+def _rk4(derivative: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: float) -> np.ndarray:
+    k1 = derivative(x)
+    k2 = derivative(x + 0.5 * dt * k1)
+    k3 = derivative(x + 0.5 * dt * k2)
+    k4 = derivative(x + dt * k3)
+    return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+def _derivative(
+    force_x: np.ndarray, force_z: np.ndarray, turn: np.ndarray, x: np.ndarray
+) -> np.ndarray:
+    """Derivative (6, rollouts); forces per mass [m/s^2] in the body frame, turn [rad/s^2]."""
+    out = np.empty_like(x)
+    c, s = np.cos(x[2]), np.sin(x[2])
+    out[:3] = x[3:]
+    out[3] = c * force_x - s * force_z
+    out[4] = s * force_x + c * force_z - GRAVITY
+    out[5] = turn
+    return out
+
+
+def numpy_loop(
+    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
+) -> np.ndarray:
+    """The same, one rollout and one step after the other."""
+    states = np.empty((len(x0), inputs.shape[1] + 1, 6))
+    states[:, 0] = x0
+    for path, forces in zip(states, inputs, strict=True):
+        for t, u in enumerate(forces):
+            force = alpha[:, None] * u.reshape(2, 2)
+            total = force.sum(axis=0) / body.mass
+            arm = body.feet
+            moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum()
+            derivative = partial(_derivative, total[0], total[1], moment / body.inertia)
+            path[t + 1] = _rk4(derivative, path[t], dt)
+    return states

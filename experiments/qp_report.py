@@ -1,0 +1,82 @@
+"""What benchmark.py qp tabulates and draws."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+
+
+def table(result: dict[str, Any]) -> str:
+    """All of it as Markdown."""
+    lines = ["| single call from Python, 24 variables | trot [us] | bound [us] | "
+             "largest force error [N] |", "|---|---|---|---|"]  # fmt: skip
+    trot, bound = result["box"]["trot_velocity"], result["box"]["bound_velocity"]
+    for name, entry in trot.items():
+        error = max(e.get("force_error_max_N", 0.0) for e in (entry, bound[name]))
+        lines.append(
+            f"| {name} | {entry['us_median']:.1f} | {bound[name]['us_median']:.1f} | {error:.1e} |"
+        )
+    lines += ["", "| batch | " + " | ".join(result["batch"]["trot_velocity"]) + " |"]
+    lines.append("|---" * (1 + len(result["batch"]["trot_velocity"])) + "|")
+    for gait, batches in result["batch"].items():
+        for solver in next(iter(batches.values())):
+            cells = " | ".join(f"{entry[solver]:.1f}" for entry in batches.values())
+            lines.append(f"| {gait}, {solver}, us per problem | {cells} |")
+    lines += ["", "| rows: bound with a horizon through flight, 30 variables | us | "
+              "apart from active_set [N] |", "|---|---|---|"]  # fmt: skip
+    for name, entry in result["rows"].items():
+        apart = entry["apart_from_active_set_max_N"]
+        lines.append(f"| {name} | {entry['us_median']:.0f} | {apart:.1e} |")
+    checks = result["random"]
+    lines += [
+        "",
+        f"{checks['solves']:,} random solves, warm-started: {checks['wrong_solved']} wrong, "
+        f"{checks['iteration_limit']} at the iteration limit, {checks['other_status']} refused.",
+    ]
+    for name, entry in result["gradient"].items():
+        lines.append(
+            f"Gradient against differences, {name}: median {entry['median']:.0e}, "
+            f"max {entry['max']:.0e} of {entry['problems']} problems."
+        )
+    if "public" in result:
+        entry = result["public"]
+        lines.append(
+            f"Public problems: {entry['solved_1e9']} of {entry['problems']} to 1e-9, "
+            f"{entry['over_daqp_median']:.1f} times daqp's time (median)."
+        )
+    return "\n".join(lines) + "\n"
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Cost against the number of variables, and against the batch."""
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    sizes = sorted(int(k) for k in result["size"])
+    by_size = {int(k): v for k, v in result["size"].items()}
+    names = dict.fromkeys(n for s in sizes for n in by_size[s] if "in a scan" not in n)
+    for name in names:
+        if name == "empty jitted call":
+            continue
+        ours = name.startswith("kjax")
+        there = [n for n in sizes if name in by_size[n]]
+        left.loglog(
+            there,
+            [by_size[n][name]["us_median"] for n in there],
+            "o-" if ours else ".-",
+            lw=2.5 if ours else 1.0,
+            label=f"one step of: {name}" if name.startswith("riccati") else name,
+        )
+    left.set(xlabel="variables", ylabel="single call from Python [us]", title="QPs of the trot")
+    left.set_xticks(sizes, [str(n) for n in sizes])
+    left.minorticks_off()
+    left.legend(fontsize=7)
+    for color, (gait, batches) in zip(("C0", "C1"), result["batch"].items(), strict=True):
+        counts = [int(k) for k in batches]
+        for solver, style in (("kjax", "o-"), ("daqp loop", "--")):
+            if solver in next(iter(batches.values())):
+                values = [entry[solver] for entry in batches.values()]
+                label = f"{gait.split('_')[0]}, {solver}"
+                right.loglog(counts, values, style, color=color, label=label)
+    right.set(xlabel="batch", ylabel="us per problem", title="24 variables, cold, one thread")
+    right.legend(fontsize=8)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)

@@ -1,0 +1,128 @@
+"""The closed-loop episodes of the whole Go1 that whole_body.py learns from, kept in its folder."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kjax import cli
+from kjax.config import RunConfig, load_config, to_dict
+from kjax.episodes import code_version
+from kjax.koopman.transitions import Episode
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+DT = 0.005  # s, control tick of all these configs
+
+
+class Kind(NamedTuple):
+    """Episodes of one kind: config, range of commanded speeds [m/s], other keys."""
+
+    config: str
+    speeds: tuple[float, float]
+    keys: dict[str, Any]
+
+
+KINDS = {
+    "trot": Kind("trot_velocity_long.toml", (-0.1, 0.6), {"lmpc.command_slew": 1.0}),
+    "trot_rough": Kind("trot_rough.toml", (0.15, 0.4), {}),
+    "bound": Kind("bound_multiphase.toml", (-0.1, 0.8), {}),
+    "bound_rough": Kind("bound_rough.toml", (0.5, 0.8), {}),
+}
+
+
+def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[RunConfig]:
+    """Configs of the robots of a kind: each its own speeds, and obstacles or pushes.
+
+    On flat ground every other robot is pushed.
+    """
+    chosen, configs = KINDS[kind], []
+    for seed in range(robots):
+        rng = np.random.default_rng([seed, 17])
+        times = [0.0, 1.0, *np.arange(3.0, duration, 2.0)]
+        keys = {
+            "seed": seed,
+            "duration": duration,
+            "sim.contacts": "feet",
+            "noise.force": force,
+            "command.times": times,
+            "command.velocities": [0.0, *rng.uniform(*chosen.speeds, len(times) - 1)],
+            **chosen.keys,
+        }
+        if kind.endswith("rough"):
+            keys["terrain.seed"] = seed
+        elif seed % 2:
+            early = np.arange(1.5, duration - 1.0, 2.0)
+            at = np.round(early + rng.uniform(0.0, 1.0, len(early)), 3)
+            keys["push.times"] = list(at)
+            keys["push.forward"] = list(rng.uniform(-4.0, 4.0, len(at)))
+        configs.append(load_config(RunConfig, CONFIGS / chosen.config, keys))
+    return configs
+
+
+def kept(kind: str, args: Any, folder: Path) -> dict[str, np.ndarray] | None:
+    """A kind's recording where it lies in the folder; ends the program where another one does."""
+    path = folder / f"episodes_{kind}.npz"
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as data:
+            arrays = dict(data)
+            held = str(arrays.pop("configs")), str(arrays.pop("code", "none"))
+    except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
+        cli.fail(f"{path}: damaged ({error}); remove it, and only it is recorded again")
+    if held != label(kind_configs(kind, args.robots, args.duration, args.force)):
+        cli.fail(
+            f"{path} holds episodes of another config or other code: give --out another folder, or "
+            "remove it"
+        )
+    return arrays
+
+
+def label(configs: list[RunConfig]) -> tuple[str, str]:
+    """What a recording comes from: configs and code."""
+    wanted = json.dumps([to_dict(config) for config in configs], sort_keys=True)
+    return wanted, code_version(Path(__file__))
+
+
+def record(kind: str, args: Any, folder: Path) -> list[Episode]:
+    """Episodes of a kind, from the folder where they lie there already."""
+    from kjax.sim.batch_loop import BatchEngine
+
+    there = kept(kind, args, folder)
+    if there is not None:
+        print(f"{kind}: {args.robots} episodes of {args.duration:g} s are there", flush=True)
+        return _episodes(there)
+    configs = kind_configs(kind, args.robots, args.duration, args.force)
+    path = folder / f"episodes_{kind}.npz"
+    print(f"{kind}: recording {args.robots} episodes of {args.duration:g} s ...", flush=True)
+    begin = time.perf_counter()
+    run = BatchEngine(configs[0], torques="held").run(configs)
+    if run.interrupted:
+        raise KeyboardInterrupt
+    log, steps = run.log, np.arange(len(run.log.x)) * DT
+    disturbed = np.zeros(log.stance.shape[:2], bool)
+    for robot, config in enumerate(configs):
+        for at in config.push.times:
+            # A tick that a push reaches into counts.
+            disturbed[:, robot] |= (steps > at - DT) & (steps < at + config.push.duration)
+    arrays = {
+        **{name: getattr(log, name) for name in ("x", "feet", "force", "stance", "foot_force")},
+        "disturbed": disturbed,
+        "ticks": run.ticks,
+        "fell": run.fell,
+    }
+    scratch = path.with_suffix(".part.npz")
+    wanted, code = label(configs)
+    np.savez_compressed(scratch, configs=wanted, code=code, **arrays)
+    scratch.replace(path)
+    print(f"  {run.fell.sum()} falls, {time.perf_counter() - begin:.0f} s", flush=True)
+    return _episodes(arrays)
+
+
+def _episodes(arrays: dict[str, np.ndarray]) -> list[Episode]:
+    return [
+        Episode(**{name: arrays[name][:count, robot] for name in Episode._fields})
+        for robot, count in enumerate(arrays["ticks"])
+    ]
