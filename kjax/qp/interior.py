@@ -58,7 +58,7 @@ def descend_central_path(
         # Far from complementary it cannot be the solution, and judging costs a fifth of a step.
         near = _complementarity(problem, moved) <= NEAR * tolerance
         new = where_needed(near, lambda _, *args: _error(*args), never, problem, moved)
-        better = ok & ((new < error) | ~near)
+        better = ok & ((new < error) | jnp.isinf(error))  # the last one, until one is judged
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, best)
         return moved, best, jnp.where(better, new, error), count + 1, ok
 
