@@ -8,6 +8,7 @@ config, same code) are not repeated; a folder of another config or other code is
 
 import argparse
 import dataclasses
+import sys
 import time
 import warnings
 from pathlib import Path
@@ -143,8 +144,11 @@ def require_display() -> None:
     """End the program where no window can be opened, before anything is compiled."""
     try:
         import glfw
+        import mujoco.viewer
     except ImportError as error:
         cli.fail(f"--view: no window can be opened here ({error}); try --video")
+    if sys.platform == "darwin" and mujoco.viewer._MJPYTHON is None:
+        cli.fail("--view: on macOS start it by mjpython instead of python; or try --video")
     # MuJoCo's viewer ends the process where there is no display, so ask first.
     with warnings.catch_warnings(action="ignore"):
         if not glfw.init():

@@ -45,7 +45,7 @@ def main() -> None:
         )
     except ConfigError as error:
         cli.fail(str(error))
-    folder = args.out or Path("results") / Path(args.config).stem
+    folder = args.out or Path("results") / "sweeps" / Path(args.config).stem
     if args.draw:
         draw(sweep, folder, args.config)
         return

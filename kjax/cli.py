@@ -58,7 +58,7 @@ def run(main: Callable[[], None]) -> None:
 def script_parser(description: str) -> argparse.ArgumentParser:
     """Parser with ``--out`` for a script that takes no config; its errors are one line too."""
     parser = _Parser(description=description, allow_abbrev=False)
-    parser.add_argument("--out", type=Path, help="output folder")
+    parser.add_argument("--out", type=Path, help="output folder (default: in results/)")
     parser.set_defaults(config=None)
     return parser
 
@@ -87,11 +87,13 @@ def parse_study(
     """
     parser = script_parser(description)
     parser.add_argument("--only", nargs="+", default=list(names), metavar="NAME",
-                        help=f"of: {', '.join(names)}")  # fmt: skip
+                        help=f"of: {', '.join(names)} (default: all)")  # fmt: skip
     whole = {**counts, "jobs": (2, "worker processes, one core each")}
     for name, (default, text) in whole.items():
+        text = f"{text} (default: {default})"
         parser.add_argument(f"--{name}", type=int, default=default, help=text)
-    parser.add_argument("--base", choices=("planar", "free", "both"), default=base)
+    parser.add_argument("--base", choices=("planar", "free", "both"), default=base,
+                        help=f"of the trunk (default: {base})")  # fmt: skip
     parser.add_argument("--quick", action="store_true", help=quick)
     args = parser.parse_args()
     for name in args.only:

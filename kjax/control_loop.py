@@ -9,10 +9,11 @@ import warnings
 from math import inf
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from kjax.controller import Controller
-from kjax.observation import check_shapes
+from kjax.observation import check_observation, check_shapes, standing
 from kjax.params import ControllerParams
 from kjax.state import ControllerState, PlanInfo
 from kjax.types import Observation
@@ -31,7 +32,7 @@ class ControlLoop:
     """
 
     def __init__(self, controller: Controller, params: ControllerParams):
-        """The loop before its first sample; nothing is compiled yet.
+        """The loop before its first sample. Compiles, which takes seconds, so that no robot waits.
 
         Args:
           controller: from ``build_controller``.
@@ -41,7 +42,12 @@ class ControlLoop:
         self.state: ControllerState | None = None
         self.info: PlanInfo | None = None
         self._controller = controller
+        self._dtype = jnp.zeros(()).dtype
+        self._init = jax.jit(controller.init)
         self._plan, self._act = jax.jit(controller.plan), jax.jit(controller.act)
+        crouch = self._in_one_type(standing())
+        state, _ = self._plan(params, self._init(params, crouch), crouch)
+        jax.block_until_ready(self._act(params, state, crouch))
         self._next_plan = self._last = -inf
         self._periods: list[float] = []
         self._told = False
@@ -72,8 +78,10 @@ class ControlLoop:
                 f"time must run on from {self._last:g} s, got {time:g} s; after a restart of the "
                 "robot call reset()"
             )
+        observation = self._in_one_type(observation)
         if self.state is None:
-            self.state = self._controller.init(self.params, observation)
+            check_observation(self.params.robot, observation)
+            self.state = self._init(self.params, observation)
             self._next_plan = time
         else:
             self._watch(time - self._last)
@@ -86,6 +94,14 @@ class ControlLoop:
         self.state, torque = self._act(self.params, self.state, observation)
         return np.asarray(torque)
 
+    def _in_one_type(self, observation: Observation) -> Observation:
+        """The sample as arrays of one type, so that lists or float32 compile nothing again."""
+        return jax.tree.map(
+            lambda value: np.asarray(value, self._dtype),
+            observation,
+            is_leaf=lambda value: not isinstance(value, Observation),
+        )
+
     def _watch(self, period: float) -> None:
         """Tell once of another period than the legs' paths are timed for."""
         if self._told:
@@ -93,7 +109,7 @@ class ControlLoop:
         self._periods.append(period)
         if len(self._periods) < PERIOD_CALLS:
             return
-        # Without the extremes: the first call compiles, and a pause is no rate.
+        # Without the extremes: a pause is no rate.
         tenth = PERIOD_CALLS // 10
         period = float(np.mean(np.sort(self._periods)[tenth:-tenth]))
         wanted = self._controller.act_dt

@@ -1,6 +1,7 @@
 """A caller's own loop: when it plans, what it refuses, what it tells."""
 
 import warnings
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,24 +10,26 @@ import pytest
 from kjax.control_loop import PERIOD_CALLS, ControlLoop
 from kjax.controller import Controller
 from kjax.robots import go1
-from kjax.types import Observation
+from kjax.types import Observation, RobotParams
 
 
 class Stub:
     """A controller that counts; the loop's own logic needs no walking robot."""
 
     def __init__(self, control_dt=0.005, act_dt=0.001):
-        self.inits, self.control_dt, self.act_dt = 0, control_dt, act_dt
+        self.traced, self.control_dt, self.act_dt = 0, control_dt, act_dt
 
     def record(self):
         def init(params, observation):
-            self.inits += 1
+            self.traced += 1
             return {"plans": jnp.zeros(()), "acts": jnp.zeros(())}
 
         def plan(params, state, observation):
+            self.traced += 1
             return state | {"plans": state["plans"] + 1}, state["plans"] + 1
 
         def act(params, state, observation):
+            self.traced += 1
             return state | {"acts": state["acts"] + 1}, jnp.full((4, 3), state["plans"])
 
         return Controller(
@@ -49,8 +52,27 @@ def sample(**changes):
     return Observation(**(values | changes))
 
 
+class Params(NamedTuple):
+    """What the loop itself reads of a controller's parameters."""
+
+    robot: RobotParams = go1.PARAMS
+
+
 def loop_of(stub):
-    return ControlLoop(stub.record(), None)
+    return ControlLoop(stub.record(), Params())
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, list])
+def test_the_first_torque_is_of_the_first_sample(kind):
+    """All is compiled when the loop is made: a robot does not wait for that on its feet."""
+    stub = Stub()
+    loop = loop_of(stub)
+    assert (stub.traced, loop.state, loop.info) == (3, None, None)
+    for i in range(10):
+        values = {k: np.asarray(v).tolist() if kind is list else np.asarray(v).astype(kind)
+                  for k, v in sample()._asdict().items()}  # fmt: skip
+        loop.step(Observation(**values), 0.001 * i)
+    assert stub.traced == 3
 
 
 def test_it_plans_at_the_control_rate_whatever_clock_it_is_given():
@@ -97,7 +119,7 @@ def test_a_flag_that_is_no_number_does_not_stop_a_walk():
     assert loop.step(sample(contact=np.array([1.0, np.nan, 1.0, 1.0])), 0.001).shape == (4, 3)
 
 
-def test_a_first_call_that_compiles_and_a_pause_are_no_rate():
+def test_pauses_are_no_rate():
     loop = loop_of(Stub())
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")

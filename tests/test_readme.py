@@ -38,7 +38,7 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
 
     The ground is not at zero, and the robot looks the other way.
     """
-    with_loop, bare = blocks(repository, "docs/your_own_loop.md", "python")
+    with_loop, command, bare = blocks(repository, "docs/your_own_loop.md", "python")
     assert blocks(repository, "README.md", "python") == [with_loop]
     floor = -0.27
     model = build_model(SimConfig(floor=floor))
@@ -81,6 +81,8 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
             exec(code, scope)
             assert len(heights) == 1000
             assert 0.25 < min(heights) < max(heights) < 0.31
+        exec(command, scope)
+    np.testing.assert_array_equal(scope["loop"].params.command.velocities, np.float32(0.3))
     assert int(scope["info"].status) == 0
     assert int(scope["loop"].info.status) == 0
     # Both are the same controller.

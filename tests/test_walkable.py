@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from kjax import build_params, load_config
-from kjax.config import RunConfig
+from kjax.config import ConfigError, RunConfig
 from kjax.rigid_body import mean_force
 from kjax.robots import go1
 from kjax.types import GRAVITY, MODE_ALPHA
 from kjax.walkable import build_gaits, check_walkable
 
 HEAVY = go1.PARAMS._replace(
-    mass=np.asarray(83.0), trunk_mass=np.asarray(83.0 - float(4 * go1.PARAMS.link_mass.sum()))
+    mass=np.asarray(83.0),
+    trunk_mass=np.asarray(83.0 - float(4 * go1.PARAMS.link_mass.sum())),
+    torque_limit=7.0 * go1.PARAMS.torque_limit,
 )
 
 
@@ -63,6 +65,68 @@ def test_another_mass_than_the_robots_is_warned_of_and_a_wrong_one_refused():
     for mass in (6.0, 26.0):
         with pytest.raises(ValueError, match=rf"srb\.mass is {mass:g} kg, .* factor of 2"):
             check_walkable(config(srb__mass=mass), go1.PARAMS)
+
+
+def test_least_forces_that_lift_the_robot_name_their_key():
+    """Two feet of at least 80 N over all of a trot are more than 125 N of weight; 12.74 kg."""
+    text = r"lmpc\.force_z_min: in a cycle of trot \(0\.5 s\) the feet give at least 80 N s, and"
+    with pytest.raises(ValueError, match=text):
+        check_walkable(config(lmpc__force_z_min=80.0), go1.PARAMS)
+    check_walkable(config(lmpc__force_z_min=50.0), go1.PARAMS)
+    bound = {"gait.names": ["bound"], "bound.horizon": "multiphase"}
+    with pytest.raises(ValueError, match=r"multiphase\.force_z_min: in a cycle of bound"):
+        check_walkable(
+            load_config(RunConfig, None, bound | {"multiphase.force_z_min": 146.0}), go1.PARAMS
+        )
+
+
+def test_joint_torques_that_cannot_carry_the_weight_name_their_key():
+    """A calf of 0.213 m under a hip at 0.27 m: 35.55 N m hold about 230 N on one leg."""
+    with pytest.raises(ValueError, match=r"lmpc\.torque_fraction: in a cycle of trot"):
+        check_walkable(config(lmpc__torque_fraction=0.3), go1.PARAMS)
+    check_walkable(config(lmpc__torque_fraction=0.4), go1.PARAMS)
+    bound = {"gait.names": ["bound"], "bound.horizon": "multiphase"}
+    with pytest.raises(ValueError, match=r"multiphase\.torque_fraction: in a cycle of bound"):
+        check_walkable(
+            load_config(RunConfig, None, bound | {"multiphase.torque_fraction": 0.3}), go1.PARAMS
+        )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("lmpc.torque_fraction", 5.0),
+        ("lmpc.torque_fraction", 1.01),
+        ("lmpc.friction", 1e-6),
+        ("multiphase.friction", 1e-6),
+    ],
+)
+def test_limits_that_mean_nothing_are_refused(key, value):
+    with pytest.raises(ConfigError, match=key.split(".")[1]):
+        load_config(RunConfig, None, {key: value})
+
+
+@pytest.mark.parametrize("inertia", [1e-9, 0.09, 1.7, 40.0])
+def test_an_inertia_far_from_the_robots_is_refused(inertia):
+    with pytest.raises(ValueError, match=rf"srb\.inertia is {inertia:g} kg m\^2, .* factor of 4"):
+        check_walkable(config(srb__inertia=inertia), go1.PARAMS)
+    check_walkable(config(srb__inertia=0.3), go1.PARAMS)
+
+
+@pytest.mark.parametrize(
+    ("key", "point", "text"),
+    [
+        ("feet_front", [0.2, 0.1], "above the centre of mass"),
+        ("feet_front", [-0.01, -0.27], "not ahead of srb.feet_rear"),
+        ("feet_rear", [-0.2, -1.5], "from the hip at"),
+        ("feet_front", [2.0, -0.27], "from the hip at"),
+    ],
+)
+def test_contact_points_that_no_foot_can_have_are_refused(key, point, text):
+    keys = {"srb.feet_rear": [0.0, -0.27], f"srb.{key}": point}
+    with pytest.raises(ValueError, match=rf"srb\.{key} is .*{text}"):
+        check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
+    check_walkable(config(srb__feet_front=[0.2, -0.25], srb__feet_rear=[-0.2, -0.25]), go1.PARAMS)
 
 
 @pytest.mark.parametrize(

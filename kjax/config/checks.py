@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from math import inf
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
@@ -13,6 +14,10 @@ NonNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(gt=0)]
 # The only quantities that may be infinite: bounds that a user wants to switch off.
 Bound = Annotated[float, Field(allow_inf_nan=True)]
+# Rows that a user may switch off by inf. Feet that hold no force along the ground balance nothing,
+# and no joint gives more than its limit.
+Friction = Annotated[float, Field(ge=0.05, allow_inf_nan=True)]
+TorqueFraction = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
 
 def require_timeline(times: Sequence[float], name: str, values: Sequence[object]) -> None:
@@ -43,4 +48,12 @@ def require_order(config: Any) -> None:
         raise ValueError(
             f"force_z_min must not exceed force_z_max, got {config.force_z_min} and "
             f"{config.force_z_max}"
+        )
+
+
+def require_fraction(config: Any) -> None:
+    """Refuse a part of the joint torque limits above 1 that is not inf."""
+    if 1.0 < config.torque_fraction < inf:
+        raise ValueError(
+            f"torque_fraction must be at most 1, or inf for no rows, got {config.torque_fraction}"
         )

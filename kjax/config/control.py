@@ -10,8 +10,11 @@ from kjax.config.checks import (
     STRICT,
     Bound,
     Count,
+    Friction,
     NonNegative,
     Positive,
+    TorqueFraction,
+    require_fraction,
     require_order,
     require_timeline,
 )
@@ -77,14 +80,15 @@ class LmpcConfig:
     """Relative KKT residual at which the QP counts as solved; floored by float32's rounding [-]."""
     max_iterations: Count = 2000
     """Iteration limit of the QP [-]."""
-    friction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 0.6
+    friction: Friction = 0.6
     """mu of rows |F_x| <= mu F_z within a stance; inf for the paper's box alone [-]."""
-    torque_fraction: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 0.95
+    torque_fraction: TorqueFraction = 0.95
     """Part of the joint torque limits that planned forces may take, as rows; inf for none [-]."""
 
     @model_validator(mode="after")
     def _check(self) -> "LmpcConfig":
         require_order(self)
+        require_fraction(self)
         if self.solver == "projected_gradient" and min(self.friction, self.torque_fraction) < inf:
             raise ValueError(
                 "solver = 'projected_gradient' cannot keep rows of friction and torque_fraction:"
@@ -189,7 +193,7 @@ class MultiPhaseConfig:
     """Lower bound of F_z per leg, world frame [N]."""
     force_z_max: Bound = 340.0
     """Upper bound of F_z per leg, world frame [N]."""
-    friction: Positive = 0.6
+    friction: Annotated[float, Field(ge=0.05)] = 0.6
     """mu of the pyramid |F_x| <= mu F_z; below the ground's, for margin [-]."""
     torque_fraction: Annotated[float, Field(gt=0, le=1)] = 0.95
     """Part of the thigh's and the calf's torque limit that planned forces may take [-]."""
