@@ -4,7 +4,6 @@ Problems are drawn in batches from a known KKT point, so that the least cost is 
 solver; the judge is plain NumPy. Linear programs that are not drawn so go to HiGHS.
 """
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +17,9 @@ TOLERANCE = 1e-9
 SHAPES = ((2, 3), (5, 8), (12, 16), (24, 36))  # variables, rows
 BATCH = 256
 KINDS = ("known", "infeasible", "unbounded", "box", "linear")
+# Of that many batches a method solves one: in a batch all wait for the slowest, and first-order
+# methods take up to thousands of iterations.
+EVERY = {"interior_point": 2, "admm": 8, "box admm": 8, "box projected_gradient": 8}
 COUNTS = (
     "problems", "solved", "proven", "iteration_limit", "other",
     "wrong_solved", "wrong_infeasible", "wrong_unbounded",
@@ -219,42 +221,49 @@ def linear_program_cost(data: tuple[np.ndarray, ...]) -> float | None:
     return float(found.fun) if found.status == 0 else None
 
 
-def _solvers(kind: str) -> Iterator[tuple[str, Any]]:
-    """Methods by name, each a compiled function of a batch: x and status."""
-    if kind == "box":
-        for method in qp.METHODS:
+def _box_solver(method: str) -> Any:
+    """A compiled function of a batch: x and status. Its rows have no members."""
 
-            def box(
-                H: Any, q: Any, C: Any, a: Any, b: Any, lower: Any, upper: Any, method: Any = method
-            ) -> Any:
-                del C, a, b
-                found = qp.solve(qp.prepare(H), q, lower, upper, method=method, tolerance=TOLERANCE)
-                return found.x, found.status
+    def solve(H: Any, q: Any, C: Any, a: Any, b: Any, lower: Any, upper: Any) -> Any:
+        del C, a, b
+        found = qp.solve(qp.prepare(H), q, lower, upper, method=method, tolerance=TOLERANCE)
+        return found.x, found.status
 
-            yield f"box {method}", jax.jit(jax.vmap(box))
-    for method in qp.ROW_METHODS:
+    return jax.jit(jax.vmap(solve))
 
-        def rows(*data: Any, method: Any = method) -> Any:
-            found = qp.solve_rows(*data, method=method, tolerance=TOLERANCE)
-            return found.x, found.status
 
-        yield method, jax.jit(jax.vmap(rows))
+def _row_solver(method: str) -> Any:
+    def solve(*data: Any) -> Any:
+        found = qp.solve_rows(*data, method=method, tolerance=TOLERANCE)
+        return found.x, found.status
+
+    return jax.jit(jax.vmap(solve))
 
 
 def count(
     total: int, methods: Any = None, shapes: Any = None, kinds: Any = KINDS, seed: int = 0
 ) -> dict[str, dict[str, int]]:
-    """Outcomes by method and kind over about ``total`` solves."""
+    """Outcomes by method and kind over about ``total`` solves; slow methods get fewer of them."""
     shapes = SHAPES if shapes is None else shapes
     rng = np.random.default_rng(seed)
     result: dict[str, dict[str, int]] = {}
-    jobs = [(kind, shape) for kind in kinds for shape in shapes]
-    for kind, (n, m) in tqdm(jobs, desc="random QPs with rows", leave=False, disable=None):
-        solvers = [s for s in _solvers(kind) if methods is None or s[0] in methods]
-        rounds = max(1, round(total / (len(jobs) * BATCH * max(len(solvers), 1))))
-        for _ in range(rounds):
-            problems = draw(rng, kind, BATCH, n, m)
-            for name, solve in solvers:
+    rows = {method: _row_solver(method) for method in qp.ROW_METHODS}
+    every = {f"box {method}": _box_solver(method) for method in qp.METHODS} | rows
+    chosen = {
+        kind: {
+            name: solve
+            for name, solve in (every if kind == "box" else rows).items()
+            if methods is None or name in methods
+        }
+        for kind in kinds
+    }
+    share = sum(1 / EVERY.get(name, 1) for names in chosen.values() for name in names)
+    rounds = max(1, round(total / (share * len(shapes) * BATCH)))
+    jobs = [(kind, shape, i) for shape in shapes for kind in kinds for i in range(rounds)]
+    for kind, (n, m), i in tqdm(jobs, desc="random QPs with rows", leave=False, disable=None):
+        problems = draw(rng, kind, BATCH, n, m)
+        for name, solve in chosen[kind].items():
+            if i % EVERY.get(name, 1) == 0:
                 x, status = map(np.asarray, solve(*problems.data))
                 entry = result.setdefault(f"{name}, {kind}", dict.fromkeys(COUNTS, 0))
                 _tally(entry, problems, x, status)
