@@ -13,6 +13,7 @@ from kjax import planning, qp
 from kjax.config import RunConfig, load_config
 from kjax.controller import build_controller
 from kjax.mpc import lmpc, multiphase
+from kjax.resolve import controller_spec
 from kjax.sim.episode import initial_state
 from kjax.sim.mujoco_loop import build_simulation
 
@@ -23,7 +24,7 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
     """What ``planner`` returns as memory along a walk of the config's own controller."""
     simulation = build_simulation(config)
     controller, params, model = simulation.controller, simulation.params, simulation.model
-    recorder = build_controller(config, planner)
+    recorder = build_controller(controller_spec(config), planner)
     plan, act = jax.jit(controller.plan), jax.jit(controller.act)
     look = jax.jit(lambda state, seen: recorder.plan(params, state, seen)[0].memory)
     data = mujoco.MjData(model)
@@ -48,7 +49,7 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
 def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
     """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
     config = load_config(RunConfig, CONFIGS / f"{name}.toml", changes or {})
-    own = planning.build_planner(config)
+    own = planning.build_planner(controller_spec(config))
 
     def planner(params: Any, task: Any) -> Any:
         seen: dict[str, Any] = {}
@@ -79,7 +80,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
 def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
     """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
     config = load_config(RunConfig, CONFIGS / "bound_multiphase.toml", {})
-    own = planning.build_planner(config)
+    own = planning.build_planner(controller_spec(config))
 
     def planner(params: Any, task: Any) -> Any:
         seen: list[Any] = []

@@ -25,7 +25,7 @@ from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.mjx_loop import MjxEngine
 from kjax.sim.mujoco_loop import build_simulation, simulate
-from kjax.sim.observe import resolve
+from kjax.sim.observe import find_addresses
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 BATCHES = (16, 128, 1024)
@@ -133,7 +133,7 @@ def bare_batch(
     per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
     batch = mujoco.batch.Batch(model, nsim=len(configs), nthread=engine.threads)
     qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    order = np.argsort(resolve(model).actuator.reshape(-1))
+    order = np.argsort(find_addresses(model).actuator.reshape(-1))
     starts = [initial_state(config, model.nq, model.nv) for config in configs]
 
     def once() -> float:
@@ -175,7 +175,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     model = mjx.put_model(engine.model)
     steps = round(WALK_MJX / configs[0].sim.sim_dt)
     per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
-    order = np.argsort(resolve(engine.model).actuator.reshape(-1))
+    order = np.argsort(find_addresses(engine.model).actuator.reshape(-1))
 
     def begin(qpos: Any, qvel: Any) -> Any:
         data = mjx.make_data(model)

@@ -35,7 +35,7 @@ from kjax.koopman.features import (
     history,
     touchdown,
 )
-from kjax.koopman.prediction import build_family
+from kjax.koopman.prediction import build_family, model_spec
 from kjax.koopman.transitions import Episode, Transitions, split, transitions
 from kjax.params import fit_models
 from kjax.rigid_body import own_body
@@ -226,7 +226,7 @@ def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str
         )
         with jax.enable_x64(True):
             fits = fit_models(config, go1.PARAMS)
-            family = build_family(config.koopman)
+            family = build_family(model_spec(config.koopman))
             own = fits.model if fits.prediction is None else fits.prediction.numbers
             force = np.zeros((len(Mode), 4)) if fits.prediction is None else fits.prediction.force
             feet = fits.feet if config.koopman.feet == "fixed" else None

@@ -1,6 +1,6 @@
 """kjax: Koopman-operator linear MPC for legged robots, in JAX.
 
-    from kjax import RunConfig, build_controller, build_params, load_config
+    from kjax import RunConfig, build_controller, load_config, resolve
     from kjax.robots import go1
 
 The core imports jax, numpy and pydantic only; ``kjax.sim`` needs the extra ``sim`` (MuJoCo),
@@ -11,7 +11,9 @@ from kjax.config import ConfigError, RunConfig, load_config
 from kjax.control_loop import ControlLoop
 from kjax.controller import Controller, build_controller
 from kjax.observation import check_observation
-from kjax.params import ControllerParams, build_params
+from kjax.params import ControllerParams
+from kjax.resolve import resolve
+from kjax.spec import ControllerSpec
 from kjax.types import Leg, Mode, Observation
 
 __version__ = "0.1.0"
@@ -21,12 +23,13 @@ __all__ = [
     "ControlLoop",
     "Controller",
     "ControllerParams",
+    "ControllerSpec",
     "Leg",
     "Mode",
     "Observation",
     "RunConfig",
     "build_controller",
-    "build_params",
     "check_observation",
     "load_config",
+    "resolve",
 ]

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kjax import gait, qp
-from kjax.config import RunConfig
 from kjax.legs import contact, lateral, swing
 from kjax.legs.base import Footing, LegCommand, View, build_base
 from kjax.legs.kinematics import PlanarState
@@ -30,6 +29,7 @@ from kjax.observation import (
 from kjax.params import ControllerParams
 from kjax.planning import ForceTask, Planner, build_planner
 from kjax.reference import next_clock, next_reference
+from kjax.spec import ControllerSpec
 from kjax.state import ControllerState, PlanInfo
 from kjax.types import Observation
 
@@ -73,18 +73,16 @@ class Controller(NamedTuple):
     act_dt: float
 
 
-def build_controller(config: RunConfig, planner: Planner | None = None) -> Controller:
-    """Controller functions for the static choices of a config (rates, horizon, solver).
+def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Controller:
+    """Controller functions for static choices (rates, horizon, solver).
 
     Args:
-      config: of the run.
-      planner: of forces; that of the config if ``None``.
+      spec: from ``kjax.resolve``.
+      planner: of forces; that of the spec if ``None``.
     """
-    lmpc = config.lmpc
-    control_dt, act_dt = lmpc.control_dt, config.leg.act_dt
-    base = build_base(config.sim.base)
-    plan_forces = build_planner(config) if planner is None else planner
-    hessians_stay = config.koopman.feet == "fixed" and config.koopman.model == "linear"
+    control_dt, act_dt = spec.control_dt, spec.act_dt
+    base = build_base(spec.base)
+    plan_forces = build_planner(spec) if planner is None else planner
 
     def init(params: ControllerParams, observation: Observation) -> ControllerState:
         if is_concrete((observation, params.robot)):
@@ -111,7 +109,7 @@ def build_controller(config: RunConfig, planner: Planner | None = None) -> Contr
             ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
             velocity=zero,
             correction=jnp.zeros((2,), zero.dtype),
-            memory=start_memory(params.tables, lmpc, carry=hessians_stay),
+            memory=start_memory(params.tables, spec),
             force=jnp.zeros((4, 2), zero.dtype),
             swing=swing.initial_swing(view.feet),
             feet=view.feet,

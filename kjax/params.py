@@ -30,6 +30,8 @@ class ControllerParams(NamedTuple):
     Attributes:
       robot: geometry and masses.
       tables: LMPC per contact mode.
+      friction: mu of its friction rows; not read where the spec has none [-].
+      torque_fraction: part of the joint torque limits in its torque rows; likewise [-].
       prediction: numbers of the prediction model, linearised on line; ``None`` for the linear EDMD
         model, which lies in the tables.
       feet: (M, 2, 2) nominal contact points (front, rear) of every mode, body frame [m].
@@ -53,6 +55,8 @@ class ControllerParams(NamedTuple):
 
     robot: RobotParams
     tables: LmpcTables
+    friction: Float[Array, ""]
+    torque_fraction: Float[Array, ""]
     prediction: Prediction | None
     feet: Float[Array, "M 2 2"]
     schedule: gait.Schedule
@@ -200,8 +204,11 @@ def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParam
             horizon=config.lmpc.horizon,
             feet=fits.feet,
             spread=fits.spread,
+            cautious=config.lmpc.caution > 0,
             caution=config.lmpc.caution,
         ),
+        friction=jnp.asarray(config.lmpc.friction, float),
+        torque_fraction=jnp.asarray(config.lmpc.torque_fraction, float),
         prediction=fits.prediction,
         feet=fits.feet,
         schedule=gait.build_schedule(gaits),
@@ -251,7 +258,7 @@ def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParam
 
 
 _fit_modes = jax.jit(fit_modes, static_argnames="config")
-_build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon", "caution"))
+_build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon", "cautious"))
 
 
 def multiphase_params(

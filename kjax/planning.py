@@ -5,7 +5,6 @@ use its own.
 """
 
 from collections.abc import Callable
-from math import inf
 from typing import NamedTuple
 
 import jax
@@ -13,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax import gait, qp
-from kjax.config import RunConfig
 from kjax.koopman.families import Start, operating_point
 from kjax.koopman.models import LinearModel, input_map
 from kjax.koopman.prediction import build_family
@@ -22,8 +20,8 @@ from kjax.mpc import multiphase
 from kjax.mpc.limits import force_limits
 from kjax.mpc.lmpc import LmpcMemory, reference_trajectory, shift_plan, solve_lmpc
 from kjax.params import ControllerParams
+from kjax.spec import ControllerSpec, CycleSpec
 from kjax.types import RobotParams
-from kjax.walkable import build_gaits, cycle_nodes
 
 
 class ForceTask(NamedTuple):
@@ -80,14 +78,12 @@ class ForcePlan(NamedTuple):
 Planner = Callable[[ControllerParams, ForceTask], ForcePlan]
 
 
-def build_planner(config: RunConfig) -> Planner:
-    """The planner of a config: each gait predicts as far as its parameters say."""
-    stance = _build_stance_planner(config)
-    count = int(cycle_nodes(build_gaits(config), config).sum(axis=1).max())
-    if count == 0:
+def build_planner(spec: ControllerSpec) -> Planner:
+    """The planner of a controller: each gait predicts as far as its parameters say."""
+    stance = _build_stance_planner(spec)
+    if spec.cycle is None:
         return stance
-    # The present phase may hold one node more, part of them now and part a cycle later.
-    cycle = _build_cycle_planner(config, count + 1)
+    cycle = _build_cycle_planner(spec.cycle, spec.control_dt)
 
     def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
         foresees = params.multiphase.nodes[task.clock.gait].sum() > 0
@@ -96,33 +92,32 @@ def build_planner(config: RunConfig) -> Planner:
     return plan
 
 
-def _build_stance_planner(config: RunConfig) -> Planner:
+def _build_stance_planner(spec: ControllerSpec) -> Planner:
     """The paper's scheme: the present contact mode's lifted model, as if it lasted."""
-    lmpc, koopman = config.lmpc, config.koopman
-    steps = round(lmpc.model_dt / koopman.dataset.dt)
-    family = build_family(koopman)
+    steps = round(spec.model_dt / spec.model.dt)
+    family = build_family(spec.model)
     lift = family.lift
 
     def model_here(
         params: ControllerParams, mode: Array, start: Start
     ) -> tuple[Array, LinearModel | None]:
         """Lifted state, and the model where that is not one of the tables."""
-        if koopman.model == "linear":
+        if spec.model.kind == "linear":
             z = lift(None, start)
-            if koopman.feet == "fixed":
+            if not spec.model.measured_feet:
                 return z, None
             model = jax.tree.map(lambda a: a[mode], params.tables.model)
             return z, model._replace(B=input_map(model, start.feet))
         numbers, force, _ = jax.tree.map(lambda a: a[mode], params.prediction)
-        if koopman.feet == "fixed":
+        if not spec.model.measured_feet:
             start = start._replace(feet=params.feet[mode])
         return lift(numbers, start), operating_point(family, numbers, start, force, steps)
 
-    limited = min(lmpc.friction, lmpc.torque_fraction) < inf
+    limited = spec.friction_rows or spec.torque_rows
 
     def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
         clock, body = task.clock, task.body
-        ahead = lmpc.model_dt * jnp.arange(1, lmpc.horizon + 1, dtype=task.lag.dtype)
+        ahead = spec.model_dt * jnp.arange(1, spec.horizon + 1, dtype=task.lag.dtype)
         phase, cycle = (jnp.broadcast_to(a, ahead.shape) for a in (clock.phase, clock.cycle))
         reference = reference_trajectory(
             position=task.lag,
@@ -139,24 +134,24 @@ def _build_stance_planner(config: RunConfig) -> Planner:
                 body.trig,
                 body.rotation,
                 task.stance,
-                friction=lmpc.friction,
-                torque_fraction=lmpc.torque_fraction,
+                friction=params.friction if spec.friction_rows else None,
+                torque_fraction=params.torque_fraction if spec.torque_rows else None,
             )
         duration = gait.phase_duration(params.schedule, clock)
-        rate = jnp.pi / jnp.maximum(duration, lmpc.control_dt)
+        rate = jnp.pi / jnp.maximum(duration, spec.control_dt)
         # Legs that have just come down pressed nothing before.
-        fresh = clock.elapsed < 0.5 * lmpc.control_dt
+        fresh = clock.elapsed < 0.5 * spec.control_dt
         last = jnp.where(fresh, 0.0, task.memory.plan[:4])
         start = Start(body.x, feet, last, rate * clock.elapsed, rate)
         z, model = model_here(params, task.mode, start)
         solution = solve_lmpc(
-            params.tables, task.mode, z, reference, task.memory, lmpc, model=model, rows=rows
+            params.tables, task.mode, z, reference, task.memory, spec, model=model, rows=rows
         )
         # Out of iterations, the solver's point is feasible and no worse than its start; only
         # faulty data makes the shifted last plan the better choice.
         usable = (solution.status <= qp.Status.ITERATION_LIMIT) & task.valid
         fallback = jnp.clip(
-            shift_plan(task.memory.plan, lmpc),
+            shift_plan(task.memory.plan, spec),
             params.tables.lower[task.mode],
             params.tables.upper[task.mode],
         )
@@ -173,9 +168,11 @@ def _build_stance_planner(config: RunConfig) -> Planner:
     return plan
 
 
-def _build_cycle_planner(config: RunConfig, count: int) -> Planner:
-    """A gait cycle ahead, through flight and the next stances, on ``count`` nodes."""
-    shortest = 0.5 * config.lmpc.control_dt
+def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
+    """A gait cycle ahead, through flight and the next stances."""
+    shortest = 0.5 * control_dt
+    # The present phase may hold one node more, part of them now and part a cycle later.
+    count = spec.nodes + 1
 
     def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
         settings, schedule, clock, body = params.multiphase, params.schedule, task.clock, task.body
@@ -202,8 +199,8 @@ def _build_cycle_planner(config: RunConfig, count: int) -> Planner:
             outlook,
             body.x,
             (body.x[:2] - body.base) @ body.rotation,
-            tolerance=config.multiphase.tolerance,
-            max_iterations=config.multiphase.max_iterations,
+            tolerance=spec.tolerance,
+            max_iterations=spec.max_iterations,
         )
         # A point that misses its rows by a percent still walks better than none; without one, the
         # feet carry what they carry in the periodic motion.

@@ -18,10 +18,10 @@ import numpy as np
 
 from kjax import RunConfig, load_config
 from kjax.controller import build_controller
-from kjax.params import build_params
+from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.sim.episode import initial_state
-from kjax.sim.observe import build_observe, resolve
+from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.scene import build_model
 from kjax.types import Command
 
@@ -32,10 +32,11 @@ config = load_config(
 # %% [markdown]
 # ## The controller
 #
-# `build_params` fits the Koopman models and condenses the LMPC: a second or two, once.
+# `resolve` fits the Koopman models and condenses the LMPC: a second or two, once.
 
 # %%
-controller, params = build_controller(config), build_params(config, go1.PARAMS)
+spec, params = resolve(config, go1.PARAMS)
+controller = build_controller(spec)
 plan, act = jax.jit(controller.plan), jax.jit(controller.act)
 
 # %% [markdown]
@@ -46,7 +47,7 @@ plan, act = jax.jit(controller.plan), jax.jit(controller.act)
 
 # %%
 model = build_model(config.sim, config.terrain)
-observe, actuator = build_observe(model, 5.0), resolve(model).actuator.reshape(-1)
+observe, actuator = build_observe(model, 5.0), find_addresses(model).actuator.reshape(-1)
 data = mujoco.MjData(model)
 data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
 mujoco.mj_forward(model, data)

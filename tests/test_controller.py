@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax import Observation, RunConfig, build_controller, build_params, load_config, qp
+from kjax import Observation, RunConfig, build_controller, load_config, qp
 from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, LmpcConfig
 from kjax.koopman import families, prediction, storage
 from kjax.legs.base import build_base
 from kjax.mpc.lmpc import reference_trajectory, solve_lmpc
+from kjax.params import build_params
+from kjax.resolve import controller_spec
 from kjax.robots import go1
 from kjax.types import Leg, Mode
 from kjax.walkable import build_gaits
@@ -46,7 +48,7 @@ def standing(dtype=float, com_height=0.27, **changes):
 
 @pytest.fixture(scope="module")
 def controller():
-    return build_controller(CONFIG)
+    return build_controller(controller_spec(CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +282,7 @@ BOX = {"lmpc.friction": np.inf, "lmpc.torque_fraction": np.inf}  # the paper's: 
 @pytest.fixture(scope="module")
 def box():
     """Controller, compiled plan and parameters of a bound without friction and torque rows."""
-    own = build_controller(bounding(**BOX))
+    own = build_controller(controller_spec(bounding(**BOX)))
     return own, jax.jit(own.plan), build_params(bounding(**BOX), go1.PARAMS)
 
 
@@ -545,7 +547,7 @@ def test_a_batch_of_robots_equals_single_ones(controller, params, plan):
 def test_measured_feet_and_fixed_feet_agree_where_the_feet_are_nominal(controller):
     """With the robot standing, the measured contact points differ from the fixed ones by mm."""
     config = load_config(RunConfig, None, {"sim.base": "planar", "koopman.feet": "measured"})
-    measured = build_controller(config)
+    measured = build_controller(controller_spec(config))
     low = standing(base_pos=[0.0, 0.0, float(standing().base_pos[2]) - 0.014])
     ours, info = jax.jit(measured.step)(*_start(measured, build_params(config, go1.PARAMS), low))[
         ::2
@@ -577,7 +579,7 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         ),
         lmpc=LmpcConfig(model_dt=0.02, horizon=5),
     )
-    own = build_controller(config)
+    own = build_controller(controller_spec(config))
     params = build_params(config, go1.PARAMS)
     observation = standing()
     state = own.init(params, observation)
@@ -593,7 +595,7 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
     feet = np.array(view.planar.feet - view.planar.x[:2]).reshape(2, 2, 2)
     feet[..., 1] -= go1.FOOT_RADIUS
     ends = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
-    family = prediction.build_family(config.koopman)
+    family = prediction.build_family(prediction.model_spec(config.koopman))
     numbers, force, _ = jax.tree.map(lambda a: a[Mode.TROT], params.prediction)
 
     def forces(u_before, elapsed):
@@ -610,7 +612,13 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         z = family.lift(numbers, start)
         memory = last.memory
         solved = solve_lmpc(
-            params.tables, jnp.asarray(Mode.TROT), z, reference, memory, config.lmpc, model=model
+            params.tables,
+            jnp.asarray(Mode.TROT),
+            z,
+            reference,
+            memory,
+            controller_spec(config),
+            model=model,
         )
         return solved.plan[:4]
 

@@ -7,8 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from kjax import Observation, build_controller, build_params, load_config, qp
+from kjax import Observation, build_controller, load_config, qp
 from kjax.config import RunConfig
+from kjax.params import build_params
+from kjax.resolve import controller_spec
 from kjax.robots import go1
 from kjax.types import Leg
 
@@ -27,7 +29,7 @@ def free():
 
 
 def compiled(config):
-    controller = build_controller(config)
+    controller = build_controller(controller_spec(config))
     return controller._replace(
         init=jax.jit(controller.init), plan=jax.jit(controller.plan), act=jax.jit(controller.act)
     )
@@ -145,7 +147,7 @@ def test_without_a_regulator_a_planar_state_gives_the_planar_controller_s_torque
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_state_keeps_its_tree_shapes_and_types(dtype):
-    controller = build_controller(FREE)
+    controller = build_controller(controller_spec(FREE))
     params = build_params(FREE, go1.PARAMS, dtype=dtype)
     observation = disturbed(0, dtype=dtype)
     state = jax.eval_shape(controller.init, params, observation)
@@ -194,7 +196,7 @@ def test_the_heading_to_keep_is_that_of_the_first_valid_sample(free, params):
 
 def test_the_gradient_through_act_is_finite_on_the_free_base(params):
     """Swing legs press with nothing, where a root has no derivative."""
-    controller = build_controller(FREE)
+    controller = build_controller(controller_spec(FREE))
     seen = disturbed(0)
     state, _ = controller.plan(params, controller.init(params, seen), seen)
 

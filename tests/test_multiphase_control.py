@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax import RunConfig, build_controller, build_params, load_config, qp
+from kjax import RunConfig, build_controller, load_config, qp
+from kjax.params import build_params
+from kjax.resolve import controller_spec
 from kjax.robots import go1
 from kjax.types import Leg, Mode, Observation
 
@@ -44,7 +46,7 @@ def standing(**changes):
 
 @pytest.fixture(scope="module")
 def controller():
-    return build_controller(config())
+    return build_controller(controller_spec(config()))
 
 
 @pytest.fixture(scope="module")

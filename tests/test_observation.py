@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kjax import Observation, build_controller, build_params, check_observation, load_config, qp
+from kjax import Observation, build_controller, check_observation, load_config, qp
 from kjax.config import RunConfig
 from kjax.observation import SHAPES, cast, is_valid
+from kjax.params import build_params
+from kjax.resolve import controller_spec
 from kjax.robots import go1
 
 CONFIG = load_config(RunConfig, None, {"lmpc.horizon": 2, "koopman.order": 1})
@@ -103,7 +105,7 @@ def test_a_quaternion_that_may_be_in_the_other_order_is_warned_of():
 
 @pytest.fixture(scope="module")
 def controller():
-    return build_controller(CONFIG)
+    return build_controller(controller_spec(CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +157,7 @@ def test_a_contact_flag_that_is_no_number_is_off():
 
 
 def test_lists_are_as_good_as_arrays(params):
-    controller = build_controller(CONFIG)
+    controller = build_controller(controller_spec(CONFIG))
     lists = Observation(*(np.asarray(field).tolist() for field in standing()))
     first, second = (controller.init(params, seen) for seen in (lists, standing()))
     jax.tree.map(np.testing.assert_array_equal, first, second)
@@ -164,7 +166,7 @@ def test_lists_are_as_good_as_arrays(params):
 
 def test_init_takes_a_constant_sample_inside_a_trace(params):
     """Domain randomisation: one sample for many robots."""
-    controller, good = build_controller(CONFIG), standing()
+    controller, good = build_controller(controller_spec(CONFIG)), standing()
     eager = controller.init(params, good)
     inside = jax.jit(lambda: controller.init(params, good))()
     given = jax.jit(lambda params: controller.init(params, good))(params)

@@ -9,7 +9,7 @@ import pytest
 
 from kjax.config import SimConfig
 from kjax.robots import go1
-from kjax.sim.observe import resolve
+from kjax.sim.observe import find_addresses
 from kjax.sim.scene import build_model
 
 PAGES = ("README.md", *(f"docs/{name}.md" for name in (
@@ -42,7 +42,7 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
     assert blocks(repository, "README.md", "python") == [with_loop]
     floor = -0.27
     model = build_model(SimConfig(floor=floor))
-    at = resolve(model)
+    at = find_addresses(model)
     data = mujoco.MjData(model)
     height, joints = go1.stand_pose(0.27)
     heights, calls = [], []

@@ -5,8 +5,9 @@ import warnings
 import numpy as np
 import pytest
 
-from kjax import build_params, load_config
+from kjax import load_config
 from kjax.config import ConfigError, RunConfig
+from kjax.params import build_params
 from kjax.rigid_body import mean_force
 from kjax.robots import go1
 from kjax.types import GRAVITY, MODE_ALPHA

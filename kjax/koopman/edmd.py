@@ -30,6 +30,7 @@ from kjax.koopman.observables import (
     monomials,
     paper,
 )
+from kjax.spec import DictionarySpec
 from kjax.types import INPUT_DIM, MODE_ALPHA, Mode
 
 __all__ = [
@@ -196,8 +197,8 @@ def spectrum(A: Float[np.ndarray, "N N"], dt: float) -> np.ndarray:
     return rates[np.argsort(-rates.real)]
 
 
-def build_dictionary(config: KoopmanConfig) -> Dictionary:
-    """The dictionary that a config names."""
+def build_dictionary(config: DictionarySpec | KoopmanConfig) -> Dictionary:
+    """The dictionary that a spec, or a config, names."""
     if config.dictionary == "monomials":
         return monomials(config.order)
     if config.dictionary == "fourier":

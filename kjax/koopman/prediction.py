@@ -1,5 +1,6 @@
 """The prediction model that a config names: family, numbers of every contact mode, uncertainty."""
 
+from dataclasses import fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from kjax.koopman.edmd import build_dictionary, fit_bilinear
 from kjax.koopman.families import BodyModel, Family, ResidualModel
 from kjax.koopman.learned import learned
 from kjax.koopman.observables import states_only
+from kjax.spec import DictionarySpec, ModelSpec
 from kjax.types import INPUT_DIM, MODE_ALPHA, Mode
 
 
@@ -35,30 +37,47 @@ class Prediction(NamedTuple):
     spread: Float[Array, "M 6"]
 
 
-def build_family(config: KoopmanConfig) -> Family:
-    """The family of a config's model.
+def model_spec(config: KoopmanConfig) -> ModelSpec:
+    """What shapes the program of a config's model.
 
     Raises:
       ConfigError: for a file that cannot be used.
     """
-    dt = config.dataset.dt
-    if config.model == "linear":
-        return families.linear(build_dictionary(config), dt)
-    if config.model == "srb_hover":
-        return families.linear(states_only(), dt, "srb_hover")
-    if config.model == "bilinear":
-        return families.bilinear(build_dictionary(config), dt)
-    if config.model == "srb":
-        return families.rigid_body(dt)
-    if config.model == "planted":
-        return families.planted(dt)
-    if config.model == "exact":
-        return families.exact(dt)
-    stored = _stored(config)
+    spec = ModelSpec(
+        kind=config.model, dt=config.dataset.dt, measured_feet=config.feet == "measured"
+    )
+    if config.model in ("linear", "bilinear"):
+        names = [field.name for field in fields(DictionarySpec)]
+        dictionary = DictionarySpec(**{name: getattr(config, name) for name in names})
+        return replace(spec, dictionary=dictionary)
     if config.model == "residual":
-        own = features.BY_NAME[stored.features]
-        return families.residual(dt, own, remembers=stored.features != "affine")
-    return learned(dt, stored.numbers.head.A.shape[-1] - len(states_only().names))
+        return replace(spec, features=_stored(config).features)
+    if config.model == "learned":
+        size = _stored(config).numbers.head.A.shape[-1]
+        return replace(spec, lifted=size - len(states_only().names))
+    return spec
+
+
+def build_family(spec: ModelSpec) -> Family:
+    """The family of a model."""
+    dt = spec.dt
+    if spec.kind in ("linear", "bilinear"):
+        if spec.dictionary is None:
+            raise ValueError(f"a {spec.kind} model needs a dictionary")
+        build = families.linear if spec.kind == "linear" else families.bilinear
+        return build(build_dictionary(spec.dictionary), dt)
+    if spec.kind == "srb_hover":
+        return families.linear(states_only(), dt, "srb_hover")
+    if spec.kind == "srb":
+        return families.rigid_body(dt)
+    if spec.kind == "planted":
+        return families.planted(dt)
+    if spec.kind == "exact":
+        return families.exact(dt)
+    if spec.kind == "residual":
+        own = features.BY_NAME[spec.features]
+        return families.residual(dt, own, remembers=spec.features != "affine")
+    return learned(dt, spec.lifted)
 
 
 def build_prediction(

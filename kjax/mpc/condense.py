@@ -76,7 +76,7 @@ def cautious_weights(
     A: Float[Array, "N N"],
     state_weights: Float[Array, "6"],
     spread: Float[Array, "6"],
-    caution: float,
+    caution: Float[Array, ""] | float,
     horizon: int,
 ) -> Float[Array, "k 6"]:
     """Q of every step, less where the prediction is less certain.

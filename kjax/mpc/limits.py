@@ -1,6 +1,5 @@
 """Rows on the forces of one step: friction pyramid, and joint torque limits through J^T."""
 
-from math import isfinite
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -31,8 +30,8 @@ def force_limits(
     rotation: Float[Array, "2 2"],
     stance: Bool[Array, "4"],
     *,
-    friction: float,
-    torque_fraction: float,
+    friction: Float[Array, ""] | float | None,
+    torque_fraction: Float[Array, ""] | float | None,
 ) -> ForceRows:
     """Rows for the present posture, which a horizon within a stance takes as constant.
 
@@ -41,8 +40,8 @@ def force_limits(
       trig: posture of the legs.
       rotation: (2, 2) R_world_body on (x, z): the ground's friction does not pitch with the trunk.
       stance: (4,) legs that stand; an end's rows are those of the mean of its standing legs.
-      friction: mu of |F_x| <= mu F_z, world frame; inf leaves these rows out [-].
-      torque_fraction: part of the limits in |J^T F| <= tau; inf leaves these rows out [-].
+      friction: mu of |F_x| <= mu F_z, world frame; ``None`` leaves these rows out [-].
+      torque_fraction: part of the limits in |J^T F| <= tau; ``None`` leaves these rows out [-].
     """
     weight = stance.reshape(2, 2).astype(robot.thigh_length.dtype)
     weight = weight / jnp.maximum(weight.sum(axis=1, keepdims=True), 1.0)
@@ -51,11 +50,12 @@ def force_limits(
     rows, low, high = [], [], []
     for end in range(2):
         place = np.eye(4)[2 * end : 2 * end + 2]  # (x, z) of this end among the four forces
-        if isfinite(friction):
-            rows.append(jnp.array([[1.0, -friction], [-1.0, -friction]]) @ rotation @ place)
+        if friction is not None:
+            slide = jnp.array([[1.0, 0.0], [-1.0, 0.0]]) - friction * jnp.array([0.0, 1.0])
+            rows.append(slide @ rotation @ place)
             low.append(jnp.full((2,), -jnp.inf))
             high.append(jnp.zeros((2,)))
-        if isfinite(torque_fraction):
+        if torque_fraction is not None:
             limit = torque_fraction * jnp.asarray(robot.torque_limit)[1:]
             rows.append(torque[end] @ place)
             low.append(-limit)

@@ -17,6 +17,7 @@ from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman.models import LinearModel, aggregate, input_map
 from kjax.mpc.condense import cautious_weights, condense
 from kjax.mpc.limits import ForceRows
+from kjax.spec import ControllerSpec
 from kjax.types import MODE_ALPHA, Mode
 
 
@@ -34,6 +35,7 @@ class LmpcTables(NamedTuple):
       spread: (M, 6) standard deviation of their error over one model_dt [m, rad, m/s, rad/s].
       state_weights: (M, 6) diagonal of Q.
       input_weights: (M, 4) diagonal of R [1/N^2].
+      caution: see ``condense.cautious_weights`` [-].
     """
 
     hessian: qp.Prepared
@@ -46,6 +48,7 @@ class LmpcTables(NamedTuple):
     spread: Float[Array, "M 6"]
     state_weights: Float[Array, "M 6"]
     input_weights: Float[Array, "M 4"]
+    caution: Float[Array, ""]
 
 
 class LmpcMemory(NamedTuple):
@@ -118,7 +121,8 @@ def build_tables(
     horizon: int,
     feet: Float[Array, "M 2 2"],
     spread: Float[Array, "M 6"] | None = None,
-    caution: float = 0.0,
+    cautious: bool = False,
+    caution: Float[Array, ""] | float = 0.0,
 ) -> LmpcTables:
     """Tables of all contact modes; call it in float64.
 
@@ -129,7 +133,8 @@ def build_tables(
       horizon: number k of prediction steps.
       feet: (M, 2, 2) nominal contact points [m].
       spread: (M, 6) standard deviation of the one-step error of each model; ``None`` for none.
-      caution: see ``condense.cautious_weights``.
+      cautious: whether uncertain steps weigh less.
+      caution: by how much, see ``condense.cautious_weights`` [-].
     """
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
     Q, R, lower, upper, u_ref = settings
@@ -141,7 +146,7 @@ def build_tables(
     def one(
         model: LinearModel, Q: Array, R: Array, feet: Array, swinging: Array, spread: Array
     ) -> tuple[qp.Prepared, Array, Array]:
-        if caution > 0:
+        if cautious:
             Q = cautious_weights(model.A, Q, spread, caution, horizon)
         problem = condense(model.A, input_map(model, feet), Q, R, horizon)
         return qp.prepare(problem.H, swinging), problem.F, problem.G
@@ -158,6 +163,7 @@ def build_tables(
         spread=spread,
         state_weights=Q,
         input_weights=R,
+        caution=jnp.asarray(caution, float),
     )
 
 
@@ -201,10 +207,11 @@ class LmpcSolution(NamedTuple):
     warm: qp.Warm | None
 
 
-def start_memory(tables: LmpcTables, config: LmpcConfig, *, carry: bool) -> LmpcMemory:
-    """Memory before the first tick; ``carry`` where the Hessian of a mode stays what it is."""
+def start_memory(tables: LmpcTables, spec: ControllerSpec) -> LmpcMemory:
+    """Memory before the first tick; with a tableau where the Hessian of a mode stays what it is."""
     warm = None
-    if carry and config.warm_start and config.solver == "tableau":
+    hessian_stays = spec.model.kind == "linear" and not spec.model.measured_feet
+    if hessian_stays and spec.warm_start and spec.solver == "tableau":
         warm = qp.start(jax.tree.map(lambda a: a[0], tables.hessian))
     return LmpcMemory(
         plan=jnp.zeros_like(tables.lower[0]), mode=jnp.full((), -1, jnp.int32), warm=warm
@@ -217,7 +224,7 @@ def solve_lmpc(
     z: Float[Array, "N"],
     reference: Float[Array, "k 6"],
     memory: LmpcMemory,
-    config: LmpcConfig,
+    spec: ControllerSpec,
     model: LinearModel | None = None,
     rows: ForceRows | None = None,
 ) -> LmpcSolution:
@@ -229,7 +236,7 @@ def solve_lmpc(
       z: lifted state, of the tables' models or of ``model``.
       reference: (k, 6) states wanted.
       memory: of the last tick.
-      config: solver settings (static).
+      spec: horizon and solver.
       model: over one model_dt and for the contact points as they are, in place of the tables' own.
       rows: on the forces of every step, besides the box.
     """
@@ -238,9 +245,9 @@ def solve_lmpc(
         hessian, index, F, G = tables.hessian, mode, tables.F[mode], tables.G[mode]
     else:
         Q, R = tables.state_weights[mode], tables.input_weights[mode]
-        if config.caution > 0:
-            Q = cautious_weights(model.A, Q, tables.spread[mode], config.caution, config.horizon)
-        problem = condense(model.A, model.B, Q, R, config.horizon)
+        if spec.cautious:
+            Q = cautious_weights(model.A, Q, tables.spread[mode], tables.caution, spec.horizon)
+        problem = condense(model.A, model.B, Q, R, spec.horizon)
         hessian, index = qp.prepare(problem.H, lower == upper), None
         F, G = problem.F, problem.G
     q = F @ z - G @ reference.reshape(-1) + tables.q_input[mode]
@@ -255,37 +262,37 @@ def solve_lmpc(
             cold,
         )
         warm = qp.Warm(x=memory.warm.x, table=table, side=side)
-    elif config.solver != "tableau":
-        warm = shift_plan(memory.plan, config)
+    elif spec.solver != "tableau":
+        warm = shift_plan(memory.plan, spec)
     options: dict[str, Any] = {
         "index": index,
-        "tolerance": config.tolerance,
-        "max_iterations": config.max_iterations,
+        "tolerance": spec.tolerance,
+        "max_iterations": spec.max_iterations,
     }
     solution: qp.Solution | qp.BoxRowSolution
     if rows is None:
-        solution = qp.solve(hessian, q, lower, upper, warm, method=config.solver, **options)
+        solution = qp.solve(hessian, q, lower, upper, warm, method=spec.solver, **options)
     else:
         solution = qp.solve_rows_from_box(
             hessian,
             q,
-            jnp.kron(jnp.eye(config.horizon, dtype=q.dtype), rows.A),
-            jnp.tile(rows.low, config.horizon),
-            jnp.tile(rows.high, config.horizon),
+            jnp.kron(jnp.eye(spec.horizon, dtype=q.dtype), rows.A),
+            jnp.tile(rows.low, spec.horizon),
+            jnp.tile(rows.high, spec.horizon),
             lower,
             upper,
             warm,
-            box_method=config.solver,
-            row_method="admm" if config.solver == "admm" else "active_set",
+            box_method=spec.solver,
+            row_method="admm" if spec.solver == "admm" else "active_set",
             **options,
         )
     kept = None if memory.warm is None else solution.warm
     return LmpcSolution(solution.x, solution.status, solution.residual, solution.iterations, kept)
 
 
-def shift_plan(plan: Float[Array, "nu"], config: LmpcConfig) -> Float[Array, "nu"]:
+def shift_plan(plan: Float[Array, "nu"], spec: ControllerSpec) -> Float[Array, "nu"]:
     """The last plan one control tick later, its final step repeated: the next warm start."""
-    blocks = plan.reshape(config.horizon, 4)
-    steps = min(round(config.control_dt / config.model_dt), config.horizon - 1)
-    index = np.minimum(np.arange(config.horizon) + steps, config.horizon - 1)
+    blocks = plan.reshape(spec.horizon, 4)
+    steps = min(round(spec.control_dt / spec.model_dt), spec.horizon - 1)
+    index = np.minimum(np.arange(spec.horizon) + steps, spec.horizon - 1)
     return blocks[index].reshape(-1)

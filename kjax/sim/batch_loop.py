@@ -25,16 +25,16 @@ import numpy as np
 from kjax.config import RunConfig
 from kjax.params import ControllerParams
 from kjax.sim.cases import (
-    BatchPart,
+    BatchSpec,
     Case,
-    batch_part,
+    batch_spec,
     check_engine,
     push_at,
     stack_cases,
     stack_params,
 )
 from kjax.sim.episode import initial_state
-from kjax.sim.observe import resolve
+from kjax.sim.observe import find_addresses
 from kjax.sim.push import pushed_body
 from kjax.sim.recording import Recording, empty_log
 from kjax.sim.scene import build_model, dress
@@ -62,12 +62,12 @@ class Calls(NamedTuple):
 
 
 class BatchEngine:
-    """C MuJoCo for batches of configs with one ``cases.batch_part``.
+    """C MuJoCo for batches of configs with one ``cases.batch_spec``.
 
     Compiles once per number of robots and kind of difference between them.
 
     Attributes:
-      part: what all configs have in common.
+      spec: what all configs have in common.
       model: MuJoCo model of the scene.
       torques: ``"every_step"``: at every physics step, as on the robot; ``"held"``: at the control
         rate, held in between, several times cheaper.
@@ -94,11 +94,11 @@ class BatchEngine:
             raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}")
-        self.part, self.torques, self.dtype = batch_part(config), torques, np.dtype(dtype)
+        self.spec, self.torques, self.dtype = batch_spec(config), torques, np.dtype(dtype)
         self.threads = _cores() if threads is None else threads
         self.model = build_model(config.sim, config.terrain, visual=False)
         self._walk = build_walk(
-            config, self.model, resolve(self.model).actuator, held=torques == "held"
+            self.spec, self.model, find_addresses(self.model).actuator, held=torques == "held"
         )
         self._calls: dict[Any, Calls] = {}
 
@@ -108,9 +108,9 @@ class BatchEngine:
         On Ctrl-C what was walked is returned, marked as interrupted.
 
         Raises:
-          ValueError: for a config with another ``batch_part``, or other durations.
+          ValueError: for a config with another ``batch_spec``, or other durations.
         """
-        require_one_batch(self.part, configs, self.torques)
+        require_one_batch(self.spec, configs, self.torques)
         threads = min(self.threads, len(configs))
         size = -(-len(configs) // threads)
         filled = [*configs, *[configs[-1]] * (threads * size - len(configs))]
@@ -146,7 +146,7 @@ class BatchEngine:
         ]
         return Recording(
             configs=list(configs),
-            dt=self.part.config.lmpc.control_dt,
+            dt=self.spec.controller.control_dt,
             ticks=parts[0][: len(configs)],
             fell=parts[1][: len(configs)],
             qpos=series[0],
@@ -213,7 +213,7 @@ class _Group:
         for i, one in enumerate(configs):
             self._qpos[i], self._qvel[i] = initial_state(one, model.nq, model.nv)
         self._batch.forward()
-        self._legs = resolve(model).actuator.reshape(-1)
+        self._legs = find_addresses(model).actuator.reshape(-1)
         self._pushed = bool((case.push_steps > 0).any())
         # Torques on their way to the joints, a ring of as many as the longest delay.
         self._ring = np.zeros((1 + int(case.delay.max()) // self._unit, count, model.nu))
@@ -354,13 +354,13 @@ def dressed(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.
     return out
 
 
-def require_one_batch(part: BatchPart, configs: Sequence[RunConfig], torques: str) -> None:
+def require_one_batch(spec: BatchSpec, configs: Sequence[RunConfig], torques: str) -> None:
     """Raise a ValueError that says which config does not fit into a batch."""
     if not configs:
         raise ValueError("configs must hold at least one config, got none")
     for i, config in enumerate(configs):
-        if batch_part(config) != part:
-            raise ValueError(f"configs[{i}] belongs to another batch (see cases.batch_part)")
+        if batch_spec(config) != spec:
+            raise ValueError(f"configs[{i}] belongs to another batch (see cases.batch_spec)")
         if config.duration != configs[0].duration:
             raise ValueError(
                 f"configs[{i}].duration is {config.duration} s, the first one's "

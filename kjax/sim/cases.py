@@ -1,12 +1,12 @@
 """A batch of configs as data: what is compiled once, and what differs between its robots.
 
-Two configs may share a compiled batch if their ``batch_part`` is the same: what is left out there
+Two configs may share a compiled batch if their ``batch_spec`` is the same: what is not in there
 (weights, bounds, timing, terrain, command, pushes, noise, friction, ...) travels as arrays with a
 leading axis B.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -16,41 +16,21 @@ import numpy as np
 
 from kjax.config import (
     CommandConfig,
-    GaitConfig,
-    LateralConfig,
-    LegConfig,
     NoiseConfig,
     PushConfig,
     RunConfig,
     SimConfig,
-    SrbConfig,
     TerrainConfig,
 )
 from kjax.params import ControllerParams, build_params
+from kjax.resolve import controller_spec
 from kjax.robots import go1
 from kjax.sim.episode import origin
-from kjax.sim.excitation import force_deviation, without_size
+from kjax.sim.excitation import force_deviation
 from kjax.sim.observe import noise_scale
 from kjax.sim.push import impulses
+from kjax.spec import ControllerSpec
 from kjax.types import Command
-from kjax.walkable import build_gaits, cycle_nodes
-
-# Numbers that reach the compiled functions through ``ControllerParams`` only.
-_LMPC = (
-    "state_weights", "input_weight", "input_reference", "force_x_max", "force_z_min",
-    "force_z_max", "height", "command_slew", "integral_gains", "integral_limits",
-    "position_slack",
-)  # fmt: skip
-_BOUND = (
-    "front_stance", "first_flight", "rear_stance", "second_flight", "ramp_start", "feet_front",
-    "feet_rear", "reference", "force_edge", "height", "state_weights", "input_weight",
-    "force_x_max",
-    "force_z_min", "force_z_max", "velocity_gain", "apex",
-)  # fmt: skip
-_MULTIPHASE = (
-    "state_weights", "input_weight", "force_x_max", "force_z_min", "force_z_max", "friction",
-    "torque_fraction", "inertia_scale", "velocity_time", "height_time",
-)  # fmt: skip
 
 
 class Case(NamedTuple):
@@ -77,60 +57,63 @@ class Case(NamedTuple):
     origin: Any
 
 
-class BatchPart(NamedTuple):
-    """What the robots of one compiled batch have in common.
+@dataclass(frozen=True, kw_only=True)
+class SceneSpec:
+    """What shapes the program of a closed loop besides its controller.
 
     Attributes:
-      config: theirs, without what may differ.
-      nodes: length of a multi-phase horizon, which follows from the gaits' timing; 0 without one.
+      base: "planar" or "free".
+      sim_dt: physics step [s].
+      cone: of the contact solver.
+      contacts: bodies that touch the ground: "all" or "feet".
+      joint_damping: [N m s/rad].
+      joint_armature: [kg m^2].
+      contact_threshold: foot force above which the contact sensor fires [N].
+      terrain: kind of the terrain.
+      obstacles: their number.
+      noise: whether sensors are noisy.
+      force_noise: whether planned forces are perturbed.
     """
 
-    config: RunConfig
-    nodes: int
+    base: str
+    sim_dt: float
+    cone: str
+    contacts: str
+    joint_damping: float
+    joint_armature: float
+    contact_threshold: float
+    terrain: str
+    obstacles: int
+    noise: bool
+    force_noise: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchSpec:
+    """What the robots of one compiled batch have in common."""
+
+    controller: ControllerSpec
+    scene: SceneSpec
 
 
 @lru_cache(maxsize=8192)
-def batch_part(config: RunConfig) -> BatchPart:
-    """What a config must share with others to walk in one compiled batch with them."""
-    gait, bound, terrain = config.gait, config.bound, config.terrain
-    plain_gait = GaitConfig(
-        names=("trot",),
-        times=(0.0,),
-        trot_flight=min(gait.trot_flight, config.lmpc.control_dt),  # whether, not how long
-        landing_time=min(gait.landing_time, config.lmpc.control_dt),
+def batch_spec(config: RunConfig) -> BatchSpec:
+    """Spec of a config: those with an equal one may walk in one compiled batch."""
+    sim, terrain, noise = config.sim, config.terrain, config.noise
+    scene = SceneSpec(
+        base=sim.base,
+        sim_dt=sim.sim_dt,
+        cone=sim.cone,
+        contacts=sim.contacts,
+        joint_damping=sim.joint_damping,
+        joint_armature=sim.joint_armature,
+        contact_threshold=sim.contact_threshold,
+        terrain=terrain.kind,
+        obstacles=terrain.count,
+        noise=noise.enabled,
+        force_noise=force_deviation(noise) > 0,
     )
-    nodes = int(cycle_nodes(build_gaits(config), config).sum(axis=1).max())
-    plain = replace(
-        config,
-        seed=0,
-        duration=1.0,
-        command=CommandConfig(times=(0.0,), velocities=(0.0,)),
-        gait=plain_gait,
-        noise=NoiseConfig(enabled=config.noise.enabled, force=without_size(config.noise)),
-        push=PushConfig(),
-        srb=SrbConfig(),
-        leg=LegConfig(act_dt=config.leg.act_dt),
-        lateral=LateralConfig(),
-        lmpc=_defaults(config.lmpc, _LMPC),
-        bound=_defaults(bound, _BOUND),
-        multiphase=_defaults(config.multiphase, _MULTIPHASE),
-        terrain=TerrainConfig(kind=terrain.kind, count=terrain.count),
-        sim=replace(
-            config.sim,
-            friction=SimConfig().friction,
-            payload=0.0,
-            delay=0.0,
-            start=(0.0, 0.0),
-            heading=0.0,
-            floor=0.0,
-        ),
-    )
-    return BatchPart(plain, nodes)
-
-
-def _defaults(section: Any, names: tuple[str, ...]) -> Any:
-    plain = type(section)()
-    return replace(section, **{name: getattr(plain, name) for name in names})
+    return BatchSpec(controller=controller_spec(config), scene=scene)
 
 
 def stack_cases(configs: Sequence[RunConfig]) -> Case:
@@ -175,7 +158,7 @@ def stack_params(configs: Sequence[RunConfig], dtype: Any) -> tuple[ControllerPa
     same for all robots stay single. Command and requests of gaits always have the axis.
 
     Args:
-      configs: of the robots, with one ``batch_part``.
+      configs: of the robots, with one ``batch_spec``.
       dtype: floating type.
 
     Returns:

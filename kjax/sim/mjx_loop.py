@@ -27,7 +27,7 @@ from kjax.sim.batch_loop import (
 )
 from kjax.sim.cases import (
     Case,
-    batch_part,
+    batch_spec,
     check_engine,
     push_at,
     stack_cases,
@@ -35,7 +35,7 @@ from kjax.sim.cases import (
 )
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
-from kjax.sim.observe import resolve
+from kjax.sim.observe import find_addresses
 from kjax.sim.push import pushed_body
 from kjax.sim.recording import Recording
 from kjax.sim.scene import build_spec
@@ -73,13 +73,13 @@ def build_model(config: RunConfig) -> mujoco.MjModel:
 
 
 class MjxEngine:
-    """MJX for batches of configs with one ``cases.batch_part``; the same calls as ``BatchEngine``.
+    """MJX for batches of configs with one ``cases.batch_spec``; the same calls as ``BatchEngine``.
 
     Compiles once per number of robots and kind of difference between them. A batch whose number of
     robots is a multiple of the number of local devices is sharded over them.
 
     Attributes:
-      part: what all configs have in common.
+      spec: what all configs have in common.
       model: the C model that MJX's was made from.
       torques: see ``batch_loop.BatchEngine``.
       traces: how often the program has been traced.
@@ -103,13 +103,13 @@ class MjxEngine:
         """
         if torques not in ("every_step", "held"):
             raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
-        self.part, self.torques, self.dtype = batch_part(config), torques, np.dtype(dtype)
+        self.spec, self.torques, self.dtype = batch_spec(config), torques, np.dtype(dtype)
         self.model = build_model(config)
         self.traces = 0
         self._mjx = self._cast(mjx.put_model(self.model, impl=impl))
         self._impl = impl
         self._walk = build_walk(
-            config, self.model, resolve(self.model).actuator, held=torques == "held"
+            self.spec, self.model, find_addresses(self.model).actuator, held=torques == "held"
         )
         self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
         per_act = round(config.leg.act_dt / config.sim.sim_dt)
@@ -123,9 +123,9 @@ class MjxEngine:
         On Ctrl-C what was walked is returned, marked as interrupted.
 
         Raises:
-          ValueError: for a config with another ``batch_part``, or other durations.
+          ValueError: for a config with another ``batch_spec``, or other durations.
         """
-        require_one_batch(self.part, configs, self.torques)
+        require_one_batch(self.spec, configs, self.torques)
         params, axes = stack_params(configs, self.dtype)
         models = dressed(self.model, configs)
         case, (own, own_axes) = stack_cases(configs), self._differences(models)
@@ -156,10 +156,10 @@ class MjxEngine:
         record = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
         alive = np.asarray(record.alive)
         fell = ~alive[-1]
-        legs = resolve(self.model).actuator.reshape(-1)
+        legs = find_addresses(self.model).actuator.reshape(-1)
         return Recording(
             configs=list(configs),
-            dt=self.part.config.lmpc.control_dt,
+            dt=self.spec.controller.control_dt,
             ticks=np.where(fell, 1 + np.argmin(alive, axis=0), len(alive)),
             fell=fell,
             qpos=record.qpos,

@@ -16,7 +16,8 @@ from jaxtyping import Array
 
 from kjax.config import RunConfig
 from kjax.controller import Controller, build_controller
-from kjax.params import ControllerParams, build_params
+from kjax.params import ControllerParams
+from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.sim import free_base
 from kjax.sim.episode import (
@@ -29,7 +30,7 @@ from kjax.sim.episode import (
     sensor_noise,
 )
 from kjax.sim.excitation import force_deviation, force_noise, perturb
-from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, noise_dim, resolve
+from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, find_addresses, noise_dim
 from kjax.sim.push import push_force, pushed_body
 from kjax.sim.scene import build_model, dress, foot_geoms
 from kjax.state import ControllerState
@@ -123,7 +124,8 @@ def build_simulation(config: RunConfig) -> Simulation:
     """Model, controller and compiled calls for a config."""
     model = build_model(config.sim, config.terrain)
     observe = build_observe(model, config.sim.contact_threshold)
-    controller, params = build_controller(config), build_params(config, go1.PARAMS)
+    spec, params = resolve(config, go1.PARAMS)
+    controller = build_controller(spec)
     parts = (model.nq, model.nv, model.nsensordata, noise_dim(config.sim.base))
     cuts, size = np.cumsum(parts[:-1]), sum(parts)
     excited = force_deviation(config.noise) > 0
@@ -190,7 +192,7 @@ def build_simulation(config: RunConfig) -> Simulation:
     simulation = Simulation(
         config=config,
         model=model,
-        addresses=resolve(model),
+        addresses=find_addresses(model),
         observe=observe,
         controller=controller,
         params=params,

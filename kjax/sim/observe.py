@@ -35,7 +35,7 @@ class Addresses(NamedTuple):
     foot_force: np.ndarray
 
 
-def resolve(model: mujoco.MjModel) -> Addresses:
+def find_addresses(model: mujoco.MjModel) -> Addresses:
     """Addresses of joints, actuators and sensors by name.
 
     Raises:
@@ -67,7 +67,7 @@ def build_observe(model: mujoco.MjModel, contact_threshold: float) -> Observe:
       model: from ``sim.scene``.
       contact_threshold: foot force above which a contact counts [N].
     """
-    at = resolve(model)
+    at = find_addresses(model)
     is_free = model.nq == 19
 
     def observe_free(qpos: Array, qvel: Array, sensordata: Array) -> Observation:

@@ -14,13 +14,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from kjax.config import RunConfig
 from kjax.controller import build_controller
 from kjax.legs.base import build_base
 from kjax.params import ControllerParams
-from kjax.sim.cases import Case
+from kjax.sim.cases import BatchSpec, Case
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
-from kjax.sim.excitation import force_deviation, force_row, perturb
+from kjax.sim.excitation import force_row, perturb
 from kjax.sim.observe import add_noise, build_observe
 from kjax.state import ControllerState
 from kjax.types import Observation
@@ -85,24 +84,23 @@ class Walk(NamedTuple):
 
 
 def build_walk(
-    config: RunConfig, model: mujoco.MjModel, actuators: np.ndarray, *, held: bool
+    spec: BatchSpec, model: mujoco.MjModel, actuators: np.ndarray, *, held: bool
 ) -> Walk:
-    """Functions for all configs with one ``batch_part``.
+    """Functions for all robots with one spec.
 
     Args:
-      config: any of them.
+      spec: theirs.
       model: of the scene; its addresses count.
       actuators: (4, 3) actuator of each joint, a permutation of all.
       held: whether ``act`` is called once per control tick rather than every ``leg.act_dt``.
     """
     # The swing legs move on by one of these times with each call of ``act``.
-    act_dt = config.lmpc.control_dt if held else config.leg.act_dt
-    controller = build_controller(replace(config, leg=replace(config.leg, act_dt=act_dt)))
-    base = build_base(config.sim.base)
-    observe = build_observe(model, config.sim.contact_threshold)
+    own, scene = spec.controller, spec.scene
+    controller = build_controller(replace(own, act_dt=own.control_dt) if held else own)
+    base = build_base(own.base)
+    observe = build_observe(model, scene.contact_threshold)
     touch = [model.sensor_adr[model.sensor(f"{leg}_foot").id] for leg in ("FR", "FL", "RR", "RL")]
     order = np.argsort(actuators.reshape(-1))
-    excited = force_deviation(config.noise) > 0
 
     def see(sensed: Sensed) -> Observation:
         return observe(
@@ -110,9 +108,9 @@ def build_walk(
         )
 
     def sense(case: Case, step: Array, sensed: Sensed) -> Observation:
-        if not config.noise.enabled:
+        if not scene.noise:
             return see(sensed)
-        row = noise_row(case.seed, step, config.sim.base).astype(sensed.qpos.dtype)
+        row = noise_row(case.seed, step, scene.base).astype(sensed.qpos.dtype)
         seen = add_noise(see(sensed), row * case.noise_scale.astype(row.dtype))
         # Else XLA draws the numbers again for each of their uses.
         return jax.lax.optimization_barrier(seen)
@@ -129,7 +127,7 @@ def build_walk(
         params: ControllerParams, case: Case, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, TickLog]:
         moved, info = controller.plan(params, state.controller, sense(case, step, sensed))
-        if excited:
+        if scene.force_noise:
             added = case.force_noise * force_row(case.seed, step)
             moved = moved._replace(force=perturb(moved.force, moved.stance, added))
         true = see(sensed)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dict
 from kjax.episodes import code_version, config_hash
-from kjax.sim.cases import BatchPart, batch_part, check_engine
+from kjax.sim.cases import BatchSpec, batch_spec, check_engine
 from kjax.sweep.grid import plan
 from kjax.sweep.store import Store, columns, lock, restart
 
@@ -35,10 +35,10 @@ class Chunk:
 
 
 def chunks_of(cases: Sequence[RunConfig], size: int) -> list[Chunk]:
-    """Cases in chunks, in order; those of one chunk have one ``batch_part`` and one duration."""
-    groups: dict[tuple[BatchPart, float], list[int]] = {}
+    """Cases in chunks, in order; those of one chunk have one ``batch_spec`` and one duration."""
+    groups: dict[tuple[BatchSpec, float], list[int]] = {}
     for number, config in enumerate(cases):
-        groups.setdefault((batch_part(config), config.duration), []).append(number)
+        groups.setdefault((batch_spec(config), config.duration), []).append(number)
     out = []
     for numbers in groups.values():
         own = min(size, len(numbers))
@@ -124,7 +124,7 @@ def _run_chunks(
     missing: int,
     threads: int | None,
 ) -> None:
-    engines: dict[BatchPart, Engine] = {}
+    engines: dict[BatchSpec, Engine] = {}
     steps = [_robot_steps(chunk.configs) for chunk in chunks]
     total = sum(steps[number] for number in todo)
     there = len(chunks) - missing
@@ -138,16 +138,16 @@ def _run_chunks(
         before = 0
         for place, number in enumerate(todo):
             chunk = chunks[number]
-            part = batch_part(chunk.configs[0])
-            if part not in engines:
-                engines[part] = build_engine(sweep, chunk.configs[0], threads)
+            spec = batch_spec(chunk.configs[0])
+            if spec not in engines:
+                engines[spec] = build_engine(sweep, chunk.configs[0], threads)
 
             def on_progress(done: int, whole: int, here: int = before, n: int = number) -> None:
                 bar.update(here + round(steps[n] * done / whole) - bar.n)
 
             bar.set_postfix_str(f"chunk {place + 1} of {len(todo)}")
             clock = time.perf_counter()
-            recording = engines[part].run(chunk.configs, on_progress)
+            recording = engines[spec].run(chunk.configs, on_progress)
             if recording.interrupted:
                 raise KeyboardInterrupt
             rows = list(recording.metrics())[: len(chunk.cases)]

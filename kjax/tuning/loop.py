@@ -25,6 +25,7 @@ from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState
 from kjax.params import ControllerParams
 from kjax.reference import next_clock
+from kjax.resolve import controller_spec
 from kjax.rigid_body import body_numbers
 from kjax.robots import go1
 from kjax.state import ControllerState
@@ -111,9 +112,9 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
     if config.sim.base != "planar":
         raise ValueError(f"sim.base must be 'planar' here, got '{config.sim.base}'")
     # A tableau carried from tick to tick would be kept for every one of them.
-    config = replace(config, lmpc=replace(config.lmpc, warm_start=False))
-    controller = build_controller(config)
-    dt = config.lmpc.control_dt
+    spec = replace(controller_spec(config), warm_start=False)
+    controller = build_controller(spec)
+    dt = spec.control_dt
     ticks = max(1, round(config.duration / dt))
     segment = ceil(sqrt(ticks)) if segment is None else min(segment, ticks)
     if segment < 1:

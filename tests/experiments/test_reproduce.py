@@ -9,7 +9,7 @@ from argparse import Namespace
 import pytest
 
 from kjax.gait import bound
-from kjax.sim.cases import batch_part
+from kjax.sim.cases import batch_spec
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_rough_ground_is_walked_on_256_fields(experiments, monkeypatch):
             experiment, config, seeds=args.seeds, terrains=args.terrains
         )
         assert len({one.terrain.seed for one in chosen}) == 256
-        assert len({batch_part(one) for one in chosen}) == 1  # one batch takes them all
+        assert len({batch_spec(one) for one in chosen}) == 1  # one batch takes them all
 
 
 def test_an_episode_passes_if_it_did_what_was_asked(experiments):

@@ -110,7 +110,7 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     back = storage.load(path, "learned")
     jax.tree.map(np.testing.assert_array_equal, back.numbers, model)
     config = KoopmanConfig(model="learned", file=str(path))
-    assert prediction.build_family(config).size == 8
+    assert prediction.build_family(prediction.model_spec(config)).size == 8
     body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
     built = prediction.build_prediction(body, config, jax.random.key(0), height=0.27)
     np.testing.assert_array_equal(built.spread, spread)
@@ -134,7 +134,7 @@ def test_a_file_that_is_no_such_model_is_refused(trained, tmp_path, change, mess
     arrays = {**np.load(path), **change}
     np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
     with pytest.raises(ValueError, match=message):
-        prediction.build_family(KoopmanConfig(model="learned", file=str(path)))
+        prediction.model_spec(KoopmanConfig(model="learned", file=str(path)))
 
 
 def test_a_file_that_is_not_there_or_no_file_at_all(tmp_path):

@@ -65,7 +65,7 @@ def test_a_model_is_loaded_under_the_name_that_it_was_saved_under(tmp_path, name
     config = KoopmanConfig(
         model="residual", file=str(tmp_path / name), dataset={"dt": 0.005, "duration": 0.1}
     )
-    assert prediction.build_family(config).name == "residual"
+    assert prediction.build_family(prediction.model_spec(config)).name == "residual"
 
 
 def test_a_file_without_an_ending_is_read_too(tmp_path):

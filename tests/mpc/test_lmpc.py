@@ -17,6 +17,7 @@ from kjax.mpc import lmpc
 from kjax.mpc.limits import force_limits
 from kjax.qp import Status
 from kjax.robots import go1
+from kjax.spec import ControllerSpec
 from kjax.types import MODE_ALPHA, Mode
 
 DT = 1e-3  # s, step of the fitted models
@@ -42,12 +43,14 @@ BOUND = BoundConfig(
     force_z_min=20.0,
     force_z_max=300.0,
 )
+SPEC = ControllerSpec(horizon=4, model_dt=0.005, tolerance=1e-9)
+FREE_SPEC = dataclasses.replace(SPEC, tolerance=1e-11)
 AHEAD = 0.005 * np.arange(1, 5)  # s
 
 lift = jax.jit(observables.paper(4).lift)
 reference_trajectory = jax.jit(lmpc.reference_trajectory)
 condense_all = jax.jit(lmpc.build_tables, static_argnames=("steps", "horizon"))
-solve = jax.jit(lmpc.solve_lmpc, static_argnames="config")
+solve = jax.jit(lmpc.solve_lmpc, static_argnames="spec")
 
 
 def here(tables, mode, feet):
@@ -135,7 +138,7 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
     Each mode with its own weights, and with the forces of its stance legs only.
     """
     x, reference = start
-    plan = solve(free, jnp.asarray(int(mode)), lift(x), reference, memory(), config=FREE)
+    plan = solve(free, jnp.asarray(int(mode)), lift(x), reference, memory(), spec=FREE_SPEC)
     assert plan.status == Status.SOLVED
     response, forced = horizon_by_hand(model, mode, FREE, x)
     own = FREE_BOUND if mode in (Mode.FRONT, Mode.REAR) else FREE
@@ -157,13 +160,13 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
 @pytest.mark.parametrize("mode", list(Mode))
 @pytest.mark.parametrize("name", ["float32", "float64"])
 def test_plans_respect_the_bounds_and_swing_legs_get_exactly_no_force(mode, name, bounded, start):
-    config = LmpcConfig(horizon=4, model_dt=0.005, force_z_min=5.0)  # default tolerance
+    spec = ControllerSpec(horizon=4, model_dt=0.005)  # default tolerance
     tables = cast(bounded, name)
     limits = [40.0, 20.0, 300.0] if mode in (Mode.FRONT, Mode.REAR) else [60.0, 5.0, 160.0]
     for scale in (1.0, 30.0):  # the larger disturbance drives every force to a bound
         x, reference = (jnp.asarray(a, name) for a in start)
         z = lift(scale * (x - reference[0]) + reference[0])
-        solution = solve(tables, jnp.asarray(int(mode)), z, reference, memory(name), config)
+        solution = solve(tables, jnp.asarray(int(mode)), z, reference, memory(name), spec)
         assert solution.status == Status.SOLVED
         forces = np.asarray(solution.plan).reshape(4, 2, 2)
         for end, standing in enumerate(MODE_ALPHA[mode] > 0):
@@ -187,9 +190,9 @@ def test_tables_hold_the_model_over_one_model_step(bounded, model):
 def test_contact_points_make_no_difference_to_a_model_that_ignores_them(bounded, start):
     x, reference = start
     arguments = (bounded, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
-    offline = solve(*arguments, config=BOUNDED)
+    offline = solve(*arguments, spec=SPEC)
     model = here(bounded, Mode.TROT, jnp.array([[0.1, -0.2], [-0.3, -0.4]]))
-    online = solve(*arguments, config=BOUNDED, model=model)
+    online = solve(*arguments, spec=SPEC, model=model)
     assert offline.status == online.status == Status.SOLVED
     # The same iterations but for rounding: 2e-16 times condition 1e5 times forces of 1e2 N.
     np.testing.assert_allclose(online.plan, offline.plan, rtol=0, atol=1e-8)
@@ -206,8 +209,8 @@ def test_measured_contact_points_at_their_nominal_place_give_the_tables_plan(
 ):
     x, reference = start
     arguments = (measured, jnp.asarray(int(mode)), lift(x), reference, memory())
-    offline = solve(*arguments, config=BOUNDED)
-    online = solve(*arguments, config=BOUNDED, model=here(measured, mode, body.feet))
+    offline = solve(*arguments, spec=SPEC)
+    online = solve(*arguments, spec=SPEC, model=here(measured, mode, body.feet))
     assert offline.status == online.status == Status.SOLVED
     # As above: rounding seen through the condition.
     np.testing.assert_allclose(online.plan, offline.plan, rtol=0, atol=1e-8)
@@ -222,7 +225,7 @@ def test_a_foot_further_forward_takes_less_of_the_weight_to_hold_the_pitch(measu
         feet = body.feet.at[0, 0].add(shift)
         arguments = (measured, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
         model = here(measured, Mode.TROT, feet)
-        force = solve(*arguments, config=BOUNDED, model=model).plan[:4]
+        force = solve(*arguments, spec=SPEC, model=model).plan[:4]
         shares.append(float(force[1] / (force[1] + force[3])))
     assert shares[0] > shares[1] > shares[2]
 
@@ -231,7 +234,7 @@ def test_plans_of_a_batch_with_mixed_modes_equal_single_plans(bounded, start):
     x, reference = start
     batch = jax.jit(
         jax.vmap(
-            lambda mode, z: lmpc.solve_lmpc(bounded, mode, z, reference, memory(), BOUNDED),
+            lambda mode, z: lmpc.solve_lmpc(bounded, mode, z, reference, memory(), SPEC),
             in_axes=(0, 0),
         )
     )
@@ -239,7 +242,7 @@ def test_plans_of_a_batch_with_mixed_modes_equal_single_plans(bounded, start):
     plans = batch(jnp.arange(5), jax.vmap(lift)(states))
     for mode in Mode:
         single = solve(
-            bounded, jnp.asarray(int(mode)), lift(states[mode]), reference, memory(), BOUNDED
+            bounded, jnp.asarray(int(mode)), lift(states[mode]), reference, memory(), SPEC
         )
         assert plans.status[mode] == single.status == Status.SOLVED
         # As above: rounding seen through the condition.
@@ -250,7 +253,7 @@ def test_changing_mode_and_state_traces_once(bounded, start):
     @jax.jit
     @chex.assert_max_traces(n=1)
     def plan(mode, x):
-        return lmpc.solve_lmpc(bounded, mode, lift(x), start[1], memory(), BOUNDED)
+        return lmpc.solve_lmpc(bounded, mode, lift(x), start[1], memory(), SPEC)
 
     results = [plan(jnp.asarray(int(mode)), start[0]) for mode in Mode]
     chex.assert_trees_all_equal_shapes_and_dtypes(*results)
@@ -264,7 +267,7 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
     def tick(carry, _):
         x, memory = carry
         mode = jnp.asarray(int(Mode.STAND), jnp.int32)
-        plan = lmpc.solve_lmpc(bounded, mode, lift(x), reference, memory, BOUNDED)
+        plan = lmpc.solve_lmpc(bounded, mode, lift(x), reference, memory, SPEC)
         for _ in range(5):
             x = srb.rk4_step(body, alpha, x, plan.plan[:4], DT)
         memory = lmpc.LmpcMemory(plan=plan.plan, mode=mode, warm=plan.warm)
@@ -272,7 +275,7 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
 
     x0 = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
     _, (states, status) = jax.jit(lambda carry: jax.lax.scan(tick, carry, length=200))(
-        (x0, lmpc.start_memory(bounded, BOUNDED, carry=True))
+        (x0, lmpc.start_memory(bounded, SPEC))
     )
     np.testing.assert_array_equal(status, Status.SOLVED)
     # 0.1 rad shrinks fivefold; the input weight on the absolute force leaves a droop in height.
@@ -359,31 +362,29 @@ def test_the_reference_rides_on_the_periodic_motion(dtype):
     [(0.005, [1, 2, 3, 3]), (0.010, [2, 3, 3, 3]), (0.001, [0, 1, 2, 3]), (1.0, [3, 3, 3, 3])],
 )
 def test_shifting_a_plan_drops_what_has_passed_and_repeats_its_end(control_dt, order):
-    config = LmpcConfig(horizon=4, model_dt=0.005, control_dt=control_dt)
+    spec = ControllerSpec(horizon=4, model_dt=0.005, control_dt=control_dt)
     plan = jnp.arange(16.0)
-    shifted = np.asarray(lmpc.shift_plan(plan, config)).reshape(4, 4)
+    shifted = np.asarray(lmpc.shift_plan(plan, spec)).reshape(4, 4)
     np.testing.assert_array_equal(shifted, np.arange(16.0).reshape(4, 4)[order])
 
 
 def test_shifting_a_plan_of_one_step_keeps_it():
     plan = jnp.arange(4.0)
-    np.testing.assert_array_equal(lmpc.shift_plan(plan, LmpcConfig(horizon=1)), plan)
+    np.testing.assert_array_equal(lmpc.shift_plan(plan, ControllerSpec(horizon=1)), plan)
 
 
 def test_a_tableau_carried_across_modes_changes_no_plan(bounded, start):
     """Trot, front, front, trot, rear: the memory of another mode is another Hessian's."""
     x, reference = start
-    carried = lmpc.start_memory(bounded, BOUNDED, carry=True)
+    carried = lmpc.start_memory(bounded, SPEC)
     plan = jax.jit(
-        lambda mode, x, carried: lmpc.solve_lmpc(
-            bounded, mode, lift(x), reference, carried, BOUNDED
-        )
+        lambda mode, x, carried: lmpc.solve_lmpc(bounded, mode, lift(x), reference, carried, SPEC)
     )
     for i, mode in enumerate((Mode.TROT, Mode.FRONT, Mode.FRONT, Mode.TROT, Mode.REAR)):
         now = jnp.asarray(int(mode), jnp.int32)
         seen = x.at[2].add(0.02 * i)
         warm = plan(now, seen, carried)
-        cold = solve(bounded, now, lift(seen), reference, memory(), config=BOUNDED)
+        cold = solve(bounded, now, lift(seen), reference, memory(), spec=SPEC)
         assert warm.status == Status.SOLVED
         np.testing.assert_allclose(warm.plan, cold.plan, rtol=0, atol=1e-8)
         carried = lmpc.LmpcMemory(plan=warm.plan, mode=now, warm=warm.warm)
@@ -399,21 +400,21 @@ def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bound
         rows = force_limits(
             go1.PARAMS, posture, jnp.eye(2), stance, friction=friction, torque_fraction=fraction
         )
-        solution = solve(bounded, mode, lift(x), reference, memory(), config=BOUNDED, rows=rows)
+        solution = solve(bounded, mode, lift(x), reference, memory(), spec=SPEC, rows=rows)
         assert solution.status == Status.SOLVED
         return np.asarray(solution.plan).reshape(4, 4), rows
 
-    box = solve(bounded, mode, lift(x), reference, memory(), config=BOUNDED).plan.reshape(4, 4)
+    box = solve(bounded, mode, lift(x), reference, memory(), spec=SPEC).plan.reshape(4, 4)
     wide, _ = planned(1e3, 1e3)
     np.testing.assert_allclose(wide, box, rtol=0, atol=1e-6)
     ratio = np.abs(box[:, ::2]) / np.maximum(box[:, 1::2], 1e-9)
     mu = 0.5 * float(ratio.max())
-    tight, _ = planned(mu, np.inf)
+    tight, _ = planned(mu, None)
     assert (np.abs(tight[:, ::2]) <= mu * tight[:, 1::2] + 1e-6).all()
-    torque = np.abs(np.einsum("rf,kf->kr", planned(np.inf, 1.0)[1].A, box))
+    torque = np.abs(np.einsum("rf,kf->kr", planned(None, 1.0)[1].A, box))
     fraction = 0.8 * float((torque / np.tile(go1.PARAMS.torque_limit[1:], 2)).max())
-    _, rows = planned(np.inf, fraction)
-    limited, _ = planned(np.inf, fraction)
+    _, rows = planned(None, fraction)
+    limited, _ = planned(None, fraction)
     assert (np.abs(limited @ rows.A.T) <= rows.high + 1e-6).all()
 
 
@@ -424,7 +425,7 @@ def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():
     R = np.array([[c, -s], [s, c]])  # nose up: body to world
     posture = leg_trig(jnp.asarray(go1.stand_pose(0.27)[1]))
     rows = force_limits(
-        go1.PARAMS, posture, jnp.asarray(R), jnp.ones(4, bool), friction=mu, torque_fraction=np.inf
+        go1.PARAMS, posture, jnp.asarray(R), jnp.ones(4, bool), friction=mu, torque_fraction=None
     )
     for world in ([0.0, 100.0], [59.9, 100.0], [-59.9, 100.0]):
         u = np.tile(R.T @ world, 2)
@@ -444,17 +445,17 @@ def test_with_rows_the_warm_start_is_carried_and_admm_plans_the_same(bounded, st
         go1.PARAMS, posture, jnp.eye(2), stance, friction=0.05, torque_fraction=0.95
     )
     z = lift(x)
-    carried = lmpc.start_memory(bounded, BOUNDED, carry=True)
-    first = solve(bounded, mode, z, reference, carried, config=BOUNDED, rows=rows)
+    carried = lmpc.start_memory(bounded, SPEC)
+    first = solve(bounded, mode, z, reference, carried, spec=SPEC, rows=rows)
     assert first.warm is not None
     again = lmpc.LmpcMemory(plan=first.plan, mode=mode, warm=first.warm)
-    second = solve(bounded, mode, z, reference, again, config=BOUNDED, rows=rows)
+    second = solve(bounded, mode, z, reference, again, spec=SPEC, rows=rows)
     assert second.iterations <= first.iterations  # the box's part of them is 0 now
-    box = solve(bounded, mode, z, reference, again, config=BOUNDED)
+    box = solve(bounded, mode, z, reference, again, spec=SPEC)
     assert box.iterations == 0
     np.testing.assert_allclose(second.plan, first.plan, rtol=0, atol=1e-8)
-    config = dataclasses.replace(BOUNDED, solver="admm")
-    admm = solve(bounded, mode, z, reference, memory(), config=config, rows=rows)
+    spec = dataclasses.replace(SPEC, solver="admm")
+    admm = solve(bounded, mode, z, reference, memory(), spec=spec, rows=rows)
     assert admm.status == first.status == Status.SOLVED
     forces = np.asarray(first.plan).reshape(4, 4)
     assert (np.abs(forces[:, ::2]) <= 0.05 * forces[:, 1::2] + 1e-6).all()

@@ -10,7 +10,6 @@ from kjax.config import RunConfig, load_config
 from kjax.sim.batch_loop import BatchEngine, dressed
 from kjax.sim.episode import fixed_part, initial_state, metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate
-from kjax.sim.observe import resolve
 
 pytestmark = pytest.mark.slow
 
@@ -62,7 +61,7 @@ def held_recording(held, configs):
 
 def test_physics_is_that_of_single_robots_to_the_last_bit(held, held_recording, configs):
     """Held torques are recorded whole, so a plain loop over ``mj_step`` can repeat them."""
-    actuators = resolve(held.model).actuator.reshape(-1)
+    actuators = find_addresses(held.model).actuator.reshape(-1)
     for i, config in enumerate(configs):
         (model,) = dressed(held.model, [config])
         data = mujoco.MjData(model)

@@ -1,69 +1,82 @@
 """A batch as data: what is left out of its common part must not reach the compiled functions."""
 
-import dataclasses
+import typing
 
 import jax
 import numpy as np
 import pytest
 
-from kjax.config import ConfigError, RunConfig, load_config
+from kjax.config import ConfigError, RunConfig, fields, load_config
 from kjax.params import build_params
 from kjax.robots import go1
 from kjax.sim import cases
-from kjax.sim.observe import resolve
+from kjax.sim.observe import find_addresses
 from kjax.sim.push import push_force
 from kjax.sim.scene import build_model
 from kjax.sim.walk import Sensed, build_walk
 
+# Where 0.9 times the default, or the next of a list of words, is no value.
+VALUES = {
+    "srb.mass": 11.0,
+    "srb.inertia": 0.3,
+    "srb.feet_front": [0.2, -0.25],
+    "srb.feet_rear": [-0.2, -0.25],
+    "gait.names": ["bound"],
+    "bound.height": 0.28,
+    "lmpc.control_dt": 0.01,
+    "lmpc.model_dt": 0.002,
+    "leg.act_dt": 0.005,
+    "sim.sim_dt": 0.0005,
+    "sim.delay": 0.01,
+    "push.duration": 0.05,
+    "terrain.slope": -5.0,
+    "koopman.dataset.dt": 0.0005,
+    "koopman.dataset.force_z": [0.0, 140.0],
+    "multiphase.max_iterations": 40,
+}
+# What a controller or a scene is compiled for.
+STATIC = {
+    "lmpc.control_dt", "lmpc.model_dt", "lmpc.horizon", "lmpc.caution", "lmpc.solver",
+    "lmpc.warm_start", "lmpc.tolerance", "lmpc.max_iterations", "leg.act_dt",
+    "koopman.model", "koopman.dictionary", "koopman.order", "koopman.fourier_count",
+    "koopman.fourier_scale", "koopman.fourier_seed", "koopman.constant_rotation", "koopman.feet",
+    "koopman.dataset.dt",
+    "gait.trot_flight", "gait.landing_time", "bound.ramp_cycles", "bound.horizon",
+    "sim.sim_dt", "sim.base", "sim.cone", "sim.contacts", "sim.joint_damping",
+    "sim.joint_armature", "sim.contact_threshold", "terrain.kind", "terrain.count",
+    "noise.enabled", "noise.force",
+}  # fmt: skip
+# What only means something beside other keys, needs a file, or is a list whose length counts.
+LEFT_OUT = {"koopman.file", "gait.times", "command.times", "push.times", "push.lateral"}
 
-def other(value):
-    """Another value of the same kind, in its range."""
-    choices = {"mean": "zero", "periodic": "constant"}
-    if isinstance(value, str):
-        return choices[value]
-    if isinstance(value, tuple):
-        return tuple(map(other, value))
-    if value is None:
-        return 0.9
-    return 0.9 * value if value else 0.1
+
+def another(name, annotation, default):
+    """Another valid value of a key."""
+    if name in VALUES:
+        return VALUES[name]
+    if typing.get_origin(annotation) is typing.Literal:
+        return next(one for one in typing.get_args(annotation) if one != default)
+    if isinstance(default, bool):
+        return not default
+    if isinstance(default, int):
+        return default + 1
+    if isinstance(default, tuple):
+        return [0.9 * part for part in default]
+    return 0.9 * default if default else 0.1
 
 
-def changed(config):
-    """The config with everything else that a batch may vary."""
-    varied = {"friction": 0.5, "payload": 1.0, "delay": 0.01, "floor": -2.0, "start": (3.0, 0.0)}
-    sections = {
-        "lmpc": {name: other(getattr(config.lmpc, name)) for name in cases._LMPC},
-        "bound": {name: other(getattr(config.bound, name)) for name in cases._BOUND},
-        "multiphase": {name: other(getattr(config.multiphase, name)) for name in cases._MULTIPHASE},
-        "leg": {
-            f.name: other(getattr(config.leg, f.name))
-            for f in dataclasses.fields(config.leg)
-            if f.name != "act_dt"  # shapes the program: a time step of the swings
-        },
-        "lateral": {
-            f.name: other(getattr(config.lateral, f.name))
-            for f in dataclasses.fields(config.lateral)
-        },
-        "srb": {
-            "mass": 11.0,
-            "inertia": 0.3,
-            "feet_front": (0.2, -0.25),
-            "feet_rear": (-0.2, -0.25),
-        },
-        "sim": varied,
-        "gait": {"stance_time": 0.2, "switch_rule": "anywhere"},
-    }
-    new = {
-        name: dataclasses.replace(getattr(config, name), **fields)
-        for name, fields in sections.items()
-    }
-    return dataclasses.replace(config, seed=4, **new)
+def keys():
+    """Every key of a run with another value."""
+    for name, info, default in fields(RunConfig):
+        if name not in LEFT_OUT:
+            yield name, another(name, info.annotation, default)
 
 
 def program(config):
     """What ``plan`` and ``act`` compute, as text."""
     model = build_model(config.sim, visual=False)
-    walk = build_walk(config, model, resolve(model).actuator, held=False)
+    spec = cases.batch_spec(config)
+    walk = build_walk(spec, model, find_addresses(model).actuator, held=False)
     params = build_params(config, go1.PARAMS)
     case = jax.tree.map(lambda leaf: leaf[0], cases.stack_cases([config]))
     sensed = Sensed(np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nsensordata))
@@ -74,29 +87,37 @@ def program(config):
     return str(plan), str(act)
 
 
+def test_every_key_either_makes_another_program_or_none():
+    """A new key of the config belongs to the spec, or must not reach the compiled functions."""
+    plain = cases.batch_spec(RunConfig())
+    changing = {
+        name
+        for name, value in keys()
+        if cases.batch_spec(load_config(RunConfig, None, {name: value})) != plain
+    }
+    assert changing == STATIC
+
+
 @pytest.mark.parametrize("base", ["planar", "free"])
 def test_what_a_batch_may_vary_changes_nothing_in_the_program(base):
-    config = load_config(RunConfig, None, {"sim.base": base})
-    varied = changed(config)
-    assert cases.batch_part(varied) == cases.batch_part(config)
-    assert program(varied) == program(config)
+    own = {"sim.base": base}
+    varied = own | {name: value for name, value in keys() if name not in STATIC}
+    config, other = (load_config(RunConfig, None, chosen) for chosen in (own, varied))
+    assert cases.batch_spec(other) == cases.batch_spec(config)
+    assert hash(cases.batch_spec(other)) == hash(cases.batch_spec(config))
+    assert program(other) == program(config)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("lmpc.horizon", 8),
-        ("lmpc.solver", "admm"),
-        ("koopman.feet", "measured"),
-        ("terrain.kind", "steps"),
-        ("gait.trot_flight", 0.05),
-        ("bound.ramp_cycles", 3),
-        ("sim.sim_dt", 0.0005),
-    ],
-)
-def test_what_is_compiled_in_makes_another_batch(key, value):
-    varied = load_config(RunConfig, None, {key: value})
-    assert cases.batch_part(varied) != cases.batch_part(RunConfig())
+def test_nodes_of_a_cycle_make_another_program():
+    cycle = {"gait.names": ["bound"], "bound.horizon": "multiphase"}
+    specs = [
+        cases.batch_spec(load_config(RunConfig, None, cycle | own))
+        for own in ({}, {"multiphase.node_dt": 0.025}, {"multiphase.tolerance": 1e-7})
+    ]
+    assert len(set(specs)) == 3
+    assert specs[0] == cases.batch_spec(
+        load_config(RunConfig, None, cycle | {"multiphase.friction": 0.5, "bound.height": 0.28})
+    )
 
 
 def test_pushes_are_those_of_a_single_run():

@@ -50,11 +50,11 @@ def test_noise_depends_on_the_seed_and_the_tick_and_has_the_size_asked_for():
 def test_only_whether_forces_are_perturbed_is_compiled_in():
     off = {"noise.force": 0.0}
     none = {"noise.enabled": False}
-    for part in (cases.batch_part, fixed_part):
+    for part in (cases.batch_spec, fixed_part):
         assert part(config()) == part(config(**{"noise.force": 3.0}))
         assert part(config()) != part(config(**off))
     assert fixed_part(config(**none)) == fixed_part(config(**off))
-    assert cases.batch_part(config(**none)) == cases.batch_part(config(**off, **none))
+    assert cases.batch_spec(config(**none)) == cases.batch_spec(config(**off, **none))
 
 
 @pytest.mark.slow

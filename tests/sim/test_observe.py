@@ -6,7 +6,7 @@ import pytest
 from kjax.config import NoiseConfig, SimConfig
 from kjax.legs.kinematics import planar_state
 from kjax.robots import go1
-from kjax.sim.observe import NOISE_DIM, add_noise, build_observe, noise_scale, resolve
+from kjax.sim.observe import NOISE_DIM, add_noise, build_observe, find_addresses, noise_scale
 from kjax.sim.scene import build_model, build_spec
 from kjax.types import Leg
 
@@ -22,7 +22,7 @@ def data(model):
     rng = np.random.default_rng(0)
     height, joints = go1.stand_pose(0.27)
     data.qpos[1], data.qpos[3:] = height, joints.reshape(-1)
-    free = resolve(model).qpos[:, 1:].reshape(-1)
+    free = find_addresses(model).qpos[:, 1:].reshape(-1)
     data.qpos[free] += 0.2 * rng.standard_normal(8)
     data.qpos[:3] += 0.2 * rng.standard_normal(3)
     data.qvel[:3] = rng.standard_normal(3)
@@ -67,7 +67,7 @@ def test_joints_are_found_by_name_whatever_the_order_of_the_legs(model, data):
             name = f"{leg.name}_{joint}"
             assert float(observation.joint_pos[leg, j]) == data.joint(name).qpos[0]
             assert float(observation.joint_vel[leg, j]) == data.joint(name).qvel[0]
-            assert model.actuator(resolve(model).actuator[leg, j]).name == name
+            assert model.actuator(find_addresses(model).actuator[leg, j]).name == name
 
 
 def test_a_model_without_a_leg_is_refused_by_name():
@@ -75,7 +75,7 @@ def test_a_model_without_a_leg_is_refused_by_name():
     spec.joint("FL_calf").name = "something"
     spec.actuator("FL_calf").target = "something"
     with pytest.raises(ValueError, match="FL_calf"):
-        resolve(spec.compile())
+        find_addresses(spec.compile())
 
 
 def test_contact_follows_the_force_threshold(model, data):

@@ -9,7 +9,7 @@ from kjax.robots import go1
 from kjax.sim import terrain
 from kjax.sim.episode import initial_state
 from kjax.sim.mujoco_loop import build_simulation, simulate
-from kjax.sim.observe import resolve
+from kjax.sim.observe import find_addresses
 from kjax.sim.scene import build_model
 
 KINDS = ("paper", "blocks", "steps", "slope", "patches")
@@ -68,7 +68,7 @@ def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
     for model in (moved, compiled):
         data = mujoco.MjData(model)
         height, joints = go1.stand_pose(0.27)
-        data.qpos[resolve(model).qpos] = joints
+        data.qpos[find_addresses(model).qpos] = joints
         data.qpos[:2] = 1.0, height + 0.1
         mujoco.mj_step(model, data, 300)
         states.append(data.qpos.copy())
@@ -131,7 +131,7 @@ def test_a_patch_is_slippery_under_a_foot():
     model = build_model(SimConfig(base="planar"), config)
     data = mujoco.MjData(model)
     height, joints = go1.stand_pose(0.27)
-    data.qpos[resolve(model).qpos] = joints
+    data.qpos[find_addresses(model).qpos] = joints
     data.qpos[1] = height
     mujoco.mj_forward(model, data)
     friction = {}

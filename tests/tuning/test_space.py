@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax import RunConfig, build_params, load_config
+from kjax import RunConfig, load_config
+from kjax.params import build_params
 from kjax.robots import go1
 from kjax.tuning.space import KINDS, build_space, tuned_config
 
