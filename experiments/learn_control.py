@@ -22,7 +22,7 @@ from kjax import cli
 from kjax.config import CommandConfig, RunConfig, load_config
 from kjax.koopman import edmd, families, learned, storage
 from kjax.koopman.dataset import ranges_from_config, sample
-from kjax.params import build_params
+from kjax.resolve import resolve
 from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.sim.batch_loop import BatchEngine
@@ -49,7 +49,7 @@ def main() -> None:
     save(path, plain)
     print(f"trained for prediction ({time.perf_counter() - clock:.0f} s)", flush=True)
     config = short(args, path)
-    params = build_params(config, go1.PARAMS)
+    _, params = resolve(config, go1.PARAMS)
     train_on = loop.draw_scenarios(config, TRAIN_SEED, args.scenarios)
     costs = costs_of(params, loop.build_loop(config, memory=MEMORY))
     both, how_both = train(args, data, lambda model: args.weight * costs(model, train_on).mean())
@@ -160,7 +160,9 @@ def costs_of(params: Any, run: loop.Loop) -> Any:
     """Function (model, scenarios) -> cost of every scenario."""
 
     def costs(model: Any, scenarios: loop.Scenario) -> jax.Array:
-        own = params._replace(prediction=params.prediction._replace(numbers=stacked(model)))
+        fits = params.fits
+        fits = fits._replace(prediction=fits.prediction._replace(numbers=stacked(model)))
+        own = params._replace(fits=fits)
         return jax.vmap(lambda s: loop.cost(go1.PARAMS, run(own, s)))(scenarios)
 
     return costs

@@ -23,10 +23,10 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
     """What ``planner`` returns as memory along a walk of the config's own controller."""
     simulation = build_simulation(config)
-    controller, params, model = simulation.controller, simulation.params, simulation.model
+    controller, tables, model = simulation.controller, simulation.tables, simulation.model
     recorder = build_controller(controller_spec(config), planner)
     plan, act = jax.jit(controller.plan), jax.jit(controller.act)
-    look = jax.jit(lambda state, seen: recorder.plan(params, state, seen)[0].memory)
+    look = jax.jit(lambda state, seen: recorder.plan(tables, state, seen)[0].memory)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
     mujoco.mj_forward(model, data)
@@ -36,11 +36,11 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
     for i in tqdm(range(steps), desc="walking", leave=False, disable=None):
         seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
         if state is None:
-            state = controller.init(params, seen)
+            state = controller.init(tables, seen)
         if i % per_tick == 0:
             kept.append(jax.tree.map(np.array, look(state, seen)))
-            state, _ = plan(params, state, seen)
-        state, torque = act(params, state, seen)
+            state, _ = plan(tables, state, seen)
+        state, torque = act(tables, state, seen)
         data.ctrl[simulation.addresses.actuator.reshape(-1)] = np.asarray(torque).reshape(-1)
         mujoco.mj_step(model, data)
     return kept
@@ -51,7 +51,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
     config = load_config(RunConfig, CONFIGS / f"{name}.toml", changes or {})
     own = planning.build_planner(controller_spec(config))
 
-    def planner(params: Any, task: Any) -> Any:
+    def planner(tables: Any, task: Any) -> Any:
         seen: dict[str, Any] = {}
 
         def solve(prepared: Any, q: Any, lower: Any, upper: Any, *args: Any, **options: Any) -> Any:
@@ -60,11 +60,11 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
 
         real = qp.solve
         with mock.patch.object(lmpc.qp, "solve", solve):
-            plan = own(params, task)
+            plan = own(tables, task)
         return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
 
     mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
-    hessian = build_simulation(config).params.tables.hessian
+    hessian = build_simulation(config).tables.lmpc.hessian
     H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
     used = (upper > lower).any(axis=1)  # nothing is planned in flight
     return {
@@ -82,7 +82,7 @@ def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
     config = load_config(RunConfig, CONFIGS / "bound_multiphase.toml", {})
     own = planning.build_planner(controller_spec(config))
 
-    def planner(params: Any, task: Any) -> Any:
+    def planner(tables: Any, task: Any) -> Any:
         seen: list[Any] = []
 
         def solve(*args: Any, **options: Any) -> Any:
@@ -95,7 +95,7 @@ def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
             mock.patch.object(multiphase.qp, "solve_rows", solve),
             mock.patch.object(planning.jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
         ):
-            plan = own(params, task)
+            plan = own(tables, task)
         return plan._replace(memory=seen[0])
 
     kept = _drive(config, planner, seconds)

@@ -37,7 +37,7 @@ from kjax.koopman.features import (
 )
 from kjax.koopman.prediction import build_family, model_spec
 from kjax.koopman.transitions import Episode, Transitions, split, transitions
-from kjax.params import fit_models
+from kjax.resolve import fit_models
 from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import Mode

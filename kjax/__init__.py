@@ -1,6 +1,6 @@
 """kjax: Koopman-operator linear MPC for legged robots, in JAX.
 
-    from kjax import RunConfig, build_controller, load_config, resolve
+    from kjax import RunConfig, build_controller, condense, load_config, resolve
     from kjax.robots import go1
 
 The core imports jax, numpy and pydantic only; ``kjax.sim`` needs the extra ``sim`` (MuJoCo),
@@ -11,7 +11,7 @@ from kjax.config import ConfigError, RunConfig, load_config
 from kjax.control_loop import ControlLoop
 from kjax.controller import Controller, build_controller
 from kjax.observation import check_observation
-from kjax.params import ControllerParams
+from kjax.params import ControllerParams, Tables, condense
 from kjax.resolve import resolve
 from kjax.spec import ControllerSpec
 from kjax.types import Leg, Mode, Observation
@@ -28,8 +28,10 @@ __all__ = [
     "Mode",
     "Observation",
     "RunConfig",
+    "Tables",
     "build_controller",
     "check_observation",
+    "condense",
     "load_config",
     "resolve",
 ]

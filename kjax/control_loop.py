@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kjax.controller import Controller
+from kjax.controller import build_controller
 from kjax.observation import check_observation, check_shapes, standing
-from kjax.params import ControllerParams
+from kjax.params import ControllerParams, condense
+from kjax.spec import ControllerSpec
 from kjax.state import ControllerState, PlanInfo
 from kjax.types import Observation
 
@@ -26,18 +27,21 @@ class ControlLoop:
     """One robot's controller, called once per ``act_dt``.
 
     Attributes:
-      params: numbers of the controller; replace it at any time, e.g. for another command.
+      params: numbers of the controller; replace it at any time, e.g. for another command: what is
+        condensed from them is built again, in milliseconds.
       state: of the controller; ``None`` before the first call.
       info: of the last plan; ``None`` before the first call.
     """
 
-    def __init__(self, controller: Controller, params: ControllerParams):
+    def __init__(self, spec: ControllerSpec, params: ControllerParams):
         """The loop before its first sample. Compiles, which takes seconds, so that no robot waits.
 
         Args:
-          controller: from ``build_controller``.
-          params: from ``build_params``.
+          spec: from ``resolve``.
+          params: likewise.
         """
+        controller = build_controller(spec)
+        self._spec = spec
         self.params = params
         self.state: ControllerState | None = None
         self.info: PlanInfo | None = None
@@ -46,11 +50,20 @@ class ControlLoop:
         self._init = jax.jit(controller.init)
         self._plan, self._act = jax.jit(controller.plan), jax.jit(controller.act)
         crouch = self._in_one_type(standing())
-        state, _ = self._plan(params, self._init(params, crouch), crouch)
-        jax.block_until_ready(self._act(params, state, crouch))
+        state, _ = self._plan(self._tables, self._init(self._tables, crouch), crouch)
+        jax.block_until_ready(self._act(self._tables, state, crouch))
         self._next_plan = self._last = -inf
         self._periods: list[float] = []
         self._told = False
+
+    @property
+    def params(self) -> ControllerParams:
+        """Numbers of the controller."""
+        return self._params
+
+    @params.setter
+    def params(self, params: ControllerParams) -> None:
+        self._params, self._tables = params, condense(self._spec, params)
 
     def reset(self) -> None:
         """Forget the robot: the next call begins anew."""
@@ -81,17 +94,17 @@ class ControlLoop:
         observation = self._in_one_type(observation)
         if self.state is None:
             check_observation(self.params.robot, observation)
-            self.state = self._init(self.params, observation)
+            self.state = self._init(self._tables, observation)
             self._next_plan = time
         else:
             self._watch(time - self._last)
         self._last = time
         if time >= self._next_plan - 0.5 * self._controller.act_dt:
-            self.state, self.info = self._plan(self.params, self.state, observation)
+            self.state, self.info = self._plan(self._tables, self.state, observation)
             late = time - self._next_plan > self._controller.control_dt
             start = time if late else self._next_plan
             self._next_plan = start + self._controller.control_dt
-        self.state, torque = self._act(self.params, self.state, observation)
+        self.state, torque = self._act(self._tables, self.state, observation)
         return np.asarray(torque)
 
     def _in_one_type(self, observation: Observation) -> Observation:

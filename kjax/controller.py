@@ -26,7 +26,7 @@ from kjax.observation import (
     is_valid,
     or_neutral,
 )
-from kjax.params import ControllerParams
+from kjax.params import ControllerParams, Tables
 from kjax.planning import ForceTask, Planner, build_planner
 from kjax.reference import next_clock, next_reference
 from kjax.spec import ControllerSpec
@@ -35,38 +35,36 @@ from kjax.types import Observation
 
 
 class Controller(NamedTuple):
-    """A controller is a record of pure functions.
+    """A controller is a record of pure functions; ``tables`` are from ``condense``.
 
     Attributes:
-      init: (params, observation) -> state. Outside ``jit`` it raises a ValueError for a sample in
+      init: (tables, observation) -> state. Outside ``jit`` it raises a ValueError for a sample in
         another convention (``observation.check_observation``).
-      plan: (params, state, observation) -> (state, info), once per control_dt.
-      act: (params, state, observation) -> (state, torque), once per act_dt; torque (4, 3) [N m]
+      plan: (tables, state, observation) -> (state, info), once per control_dt.
+      act: (tables, state, observation) -> (state, torque), once per act_dt; torque (4, 3) [N m]
         of (abduction, thigh, calf) in leg order, within the robot's limits.
-      step: plan, then act: (params, state, observation) -> (state, torque, info).
-      init_from: (params, view) -> state; ``init`` for a caller that knows the view itself, such as
+      step: plan, then act: (tables, state, observation) -> (state, torque, info).
+      init_from: (tables, view) -> state; ``init`` for a caller that knows the view itself, such as
         a rigid body without legs (``kjax.tuning``). The view is in the local frame, see
         ``ControllerState``.
-      plan_from: (params, state, view, contact, valid) -> (state, info); ``plan`` likewise.
+      plan_from: (tables, state, view, contact, valid) -> (state, info); ``plan`` likewise.
       control_dt: time between two plans [s].
       act_dt: time between two calls of ``act`` [s].
     """
 
-    init: Callable[[ControllerParams, Observation], ControllerState]
-    plan: Callable[
-        [ControllerParams, ControllerState, Observation], tuple[ControllerState, PlanInfo]
-    ]
+    init: Callable[[Tables, Observation], ControllerState]
+    plan: Callable[[Tables, ControllerState, Observation], tuple[ControllerState, PlanInfo]]
     act: Callable[
-        [ControllerParams, ControllerState, Observation],
+        [Tables, ControllerState, Observation],
         tuple[ControllerState, Float[Array, "4 3"]],
     ]
     step: Callable[
-        [ControllerParams, ControllerState, Observation],
+        [Tables, ControllerState, Observation],
         tuple[ControllerState, Float[Array, "4 3"], PlanInfo],
     ]
-    init_from: Callable[[ControllerParams, View], ControllerState]
+    init_from: Callable[[Tables, View], ControllerState]
     plan_from: Callable[
-        [ControllerParams, ControllerState, View, Bool[Array, "4"], Bool[Array, ""]],
+        [Tables, ControllerState, View, Bool[Array, "4"], Bool[Array, ""]],
         tuple[ControllerState, PlanInfo],
     ]
     control_dt: float
@@ -84,7 +82,10 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
     base = build_base(spec.base)
     plan_forces = build_planner(spec) if planner is None else planner
 
-    def init(params: ControllerParams, observation: Observation) -> ControllerState:
+    def init(tables: Tables, observation: Observation) -> ControllerState:
+        if not isinstance(tables, Tables):
+            raise TypeError(f"tables: wanted condense(spec, params), got {type(tables).__name__}")
+        params = tables.params
         if is_concrete((observation, params.robot)):
             check_observation(params.robot, observation)
         observation = cast(observation, params.position_slack.dtype)
@@ -94,11 +95,10 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         track = base.track(observation)
         if track is not None:
             track = jnp.where(valid, track, 0.0)
-        return init_from(params, base.view(params.robot, _facing(track), observation), track)
+        return init_from(tables, base.view(params.robot, _facing(track), observation), track)
 
-    def init_from(
-        params: ControllerParams, view: View, track: Array | None = None
-    ) -> ControllerState:
+    def init_from(tables: Tables, view: View, track: Array | None = None) -> ControllerState:
+        params = tables.params
         zero = jnp.zeros_like(params.position_slack)
         state = ControllerState(
             time=zero,
@@ -109,7 +109,7 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
             ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
             velocity=zero,
             correction=jnp.zeros((2,), zero.dtype),
-            memory=start_memory(params.tables, spec),
+            memory=start_memory(tables.lmpc, spec),
             force=jnp.zeros((4, 2), zero.dtype),
             swing=swing.initial_swing(view.feet),
             feet=view.feet,
@@ -123,8 +123,9 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         return jax.tree.map(jnp.copy, state)
 
     def plan(
-        params: ControllerParams, state: ControllerState, observation: Observation
+        tables: Tables, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, PlanInfo]:
+        params = tables.params
         observation = cast(observation, params.position_slack.dtype)
         valid = is_valid(observation)
         observation = or_neutral(observation, valid)
@@ -132,15 +133,16 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
             unset = valid & (state.track == 0.0).all()
             state = state._replace(track=jnp.where(unset, base.track(observation), state.track))
         view = base.view(params.robot, _facing(state.track), observation)
-        return plan_from(params, state, view, observation.contact, valid)
+        return plan_from(tables, state, view, observation.contact, valid)
 
     def plan_from(
-        params: ControllerParams,
+        tables: Tables,
         state: ControllerState,
         view: View,
         flags: Array,
         valid: Array,
     ) -> tuple[ControllerState, PlanInfo]:
+        params = tables.params
         clock = next_clock(params, state, control_dt)
         where = (clock.gait, clock.phase)
         stance, mode = params.schedule.stance[where], params.schedule.mode[where]
@@ -150,7 +152,7 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         ground = _mean_height(heights, stance, state.ground)
         wanted = next_reference(params, state, clock, view.planar, control_dt)
         solved = plan_forces(
-            params,
+            tables,
             ForceTask(
                 clock=clock,
                 stance=stance,
@@ -192,8 +194,9 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         return next_state, info
 
     def act(
-        params: ControllerParams, state: ControllerState, observation: Observation
+        tables: Tables, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, Array]:
+        params = tables.params
         observation = cast(observation, params.position_slack.dtype)
         valid = is_valid(observation)
         joint_vel = observation.joint_vel
@@ -252,10 +255,10 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         return next_state, torque
 
     def step(
-        params: ControllerParams, state: ControllerState, observation: Observation
+        tables: Tables, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, Array, PlanInfo]:
-        state, info = plan(params, state, observation)
-        state, torque = act(params, state, observation)
+        state, info = plan(tables, state, observation)
+        state, torque = act(tables, state, observation)
         return state, torque, info
 
     return Controller(

@@ -1,7 +1,6 @@
-"""All numbers of a controller, and how they come from a config: fit, condense, gather."""
+"""All numbers of a controller, and what is built from them once, off line."""
 
-import warnings
-from functools import lru_cache
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,18 +9,30 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from kjax import gait
-from kjax.config import KoopmanConfig, RunConfig, SrbConfig
-from kjax.gait.reference import SAMPLES, periodic_reference
-from kjax.koopman.edmd import fit_modes, srb_params
 from kjax.koopman.models import LinearModel
-from kjax.koopman.prediction import Prediction, build_prediction
-from kjax.koopman.validate import force_response_error
+from kjax.koopman.prediction import Prediction
 from kjax.legs import lateral, swing
 from kjax.mpc import multiphase
-from kjax.mpc.lmpc import LmpcTables, build_tables, mode_settings
-from kjax.rigid_body import body_numbers, mean_force, own_body
-from kjax.types import MODE_ALPHA, Command, Mode, RobotParams
-from kjax.walkable import build_gaits, check_walkable, cycle_nodes
+from kjax.mpc.lmpc import LmpcTables, ModeSettings, build_tables
+from kjax.observation import is_concrete
+from kjax.spec import ControllerSpec
+from kjax.types import Command, RobotParams
+
+
+class Fits(NamedTuple):
+    """What is learned from data, of every contact mode.
+
+    Attributes:
+      model: linear EDMD models over one step of the data.
+      feet: (M, 2, 2) nominal contact points, body frame [m].
+      spread: (M, 6) standard deviation of the one-step error of the model in use.
+      prediction: another prediction model, where the config names one.
+    """
+
+    model: LinearModel
+    feet: Float[Array, "M 2 2"]
+    spread: Float[Array, "M 6"]
+    prediction: Prediction | None
 
 
 class ControllerParams(NamedTuple):
@@ -29,12 +40,11 @@ class ControllerParams(NamedTuple):
 
     Attributes:
       robot: geometry and masses.
-      tables: LMPC per contact mode.
+      fits: prediction models of every contact mode.
+      modes: weights and bounds of the LMPC within a stance, of every contact mode.
+      caution: how much less its uncertain steps weigh; not read where the spec is not cautious [-].
       friction: mu of its friction rows; not read where the spec has none [-].
       torque_fraction: part of the joint torque limits in its torque rows; likewise [-].
-      prediction: numbers of the prediction model, linearised on line; ``None`` for the linear EDMD
-        model, which lies in the tables.
-      feet: (M, 2, 2) nominal contact points (front, rear) of every mode, body frame [m].
       schedule: gaits.
       gait_times: (K,) times at which a gait is asked for, the first one 0 [s].
       gaits: (K,) index of the gait asked for then.
@@ -54,11 +64,11 @@ class ControllerParams(NamedTuple):
     """
 
     robot: RobotParams
-    tables: LmpcTables
+    fits: Fits
+    modes: ModeSettings
+    caution: Float[Array, ""]
     friction: Float[Array, ""]
     torque_fraction: Float[Array, ""]
-    prediction: Prediction | None
-    feet: Float[Array, "M 2 2"]
     schedule: gait.Schedule
     gait_times: Float[Array, "K"]
     gaits: Int[Array, "K"]
@@ -75,244 +85,72 @@ class ControllerParams(NamedTuple):
     blind_damping: Float[Array, ""]
 
 
-def build_params(config: RunConfig, robot: RobotParams, *, dtype: Any = None) -> ControllerParams:
-    """Fit the Koopman models, condense the LMPC and gather everything that ``plan`` needs.
-
-    The work is done in float64 whatever the caller's default; the result is cast once. A fit whose
-    response to forces is far from the rigid body's along the LMPC's horizon is warned of.
-
-    Args:
-      config: of the run.
-      robot: e.g. ``kjax.robots.go1.PARAMS``.
-      dtype: floating type of the result; JAX's current default if ``None``.
-
-    Raises:
-      ValueError: for a config that this robot cannot walk with, naming the key.
-    """
-    dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
-    check_walkable(config, robot)
-    with jax.enable_x64(True):
-        fits = fit_models(config, robot)
-        _warn_of_fits(config, robot, fits)
-        params = jax.device_get(gather(config, robot, fits))
-    return cast(params, dtype)
-
-
-def cast(params: ControllerParams, dtype: Any) -> ControllerParams:
-    """Parameters on the device, floats in ``dtype``, integers as int32."""
-    return jax.tree.map(lambda leaf: _as(leaf, dtype), params)
-
-
-class Fits(NamedTuple):
-    """What is learned from data, of every contact mode.
+class Tables(NamedTuple):
+    """What a controller's functions take: its numbers, and what is condensed from them.
 
     Attributes:
-      model: linear EDMD models over one step of the data.
-      feet: (M, 2, 2) nominal contact points, body frame [m].
-      spread: (M, 6) standard deviation of the one-step error of the model in use.
-      prediction: another prediction model, where the config names one.
+      params: numbers; command and requests of gaits may be replaced, what the LMPC's tables are
+        made of (fits, modes, caution) is condensed already.
+      lmpc: condensed problems within a stance, of every contact mode.
     """
 
-    model: LinearModel
-    feet: Float[Array, "M 2 2"]
-    spread: Float[Array, "M 6"]
-    prediction: Prediction | None
+    params: ControllerParams
+    lmpc: LmpcTables
 
 
-def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
-    """Fit the Koopman models of a config; call it in float64.
+def condense(spec: ControllerSpec, params: ControllerParams, *, dtype: Any = None) -> Tables:
+    """Everything that depends on the numbers alone, built once.
 
-    Configs that differ elsewhere, in weights or bounds, share one fit.
+    The work is done in float64 whatever the caller's default, and the result is cast once; inside
+    ``jit``, ``grad`` or ``vmap`` it is done in the floating type of the traced numbers.
+
+    Args:
+      spec: of the controller.
+      params: its numbers, from ``kjax.resolve`` or changed since.
+      dtype: floating type of the result; JAX's current default if ``None``.
     """
-    bound = config.bound
-    sole = float(robot.foot_radius - bound.height)
-    srb = own_body(config.srb, robot, config.lmpc.height)
-    feet = ((bound.feet_front, sole), (-bound.feet_rear, sole))
-    height = config.lmpc.height if config.koopman.model == "srb_hover" else 0.0
-    # What a file holds may have changed since.
-    fit = _fit.__wrapped__ if config.koopman.file else _fit
-    return fit(srb, config.koopman, feet, height)
+    dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    if not is_concrete((params, jnp.zeros(()))):  # the latter is traced inside jit, whatever params
+        return cast(Tables(params, _condensed(spec, params)), dtype)
+    with jax.enable_x64(True):
+        tables = Tables(params, jax.device_get(_condensed(spec, jax.tree.map(_double, params))))
+    return cast(tables, dtype)
 
 
-@lru_cache(maxsize=32)
-def _fit(
-    srb: SrbConfig,
-    koopman: KoopmanConfig,
-    bound_feet: tuple[tuple[float, float], tuple[float, float]],
-    height: float,
-) -> Fits:
-    body = srb_params(srb, {Mode.FRONT: bound_feet, Mode.REAR: bound_feet})
-    key = jax.random.key(koopman.dataset.seed)
-    model, report = _fit_modes(body, koopman, key)
-    if not bool(report.finite.all()):
-        raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
-    prediction = None
-    if koopman.model != "linear":
-        prediction = build_prediction(body, koopman, key, height=height)
-    spread = report.residual_rms if prediction is None else prediction.spread
-    return jax.device_get(Fits(model, body.feet, spread, prediction))
+def with_params(tables: Tables, **changes: Any) -> Tables:
+    """Tables with other numbers that nothing is condensed from, e.g. ``command``.
+
+    Raises:
+      ValueError: for numbers that the LMPC's tables are made of: ``condense`` them again.
+    """
+    condensed = sorted({"fits", "modes", "caution"} & changes.keys())
+    if condensed:
+        raise ValueError(f"{', '.join(condensed)}: tables are made of it; use condense")
+    return tables._replace(params=tables.params._replace(**changes))
 
 
-def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
-    """Warn of a linear EDMD model that an LMPC over this horizon should not rely on."""
-    if config.koopman.model != "linear":
-        return
-    gaits = build_gaits(config)
-    planned = {
-        phase.mode
-        for one, nodes in zip(gaits, cycle_nodes(gaits, config), strict=True)
-        for phase in one.phases
-        if one.name in config.gait.names and not nodes.any()
-    }
-    srb = own_body(config.srb, robot, config.lmpc.height)
-    body = jax.device_get(srb_params(srb)._replace(feet=fits.feet))
-    duration = config.lmpc.model_dt * config.lmpc.horizon
-    for mode in sorted(planned - {Mode.FLIGHT}):
-        model, here = (jax.tree.map(lambda a, m=mode: a[m], part) for part in (fits.model, body))
-        error = force_response_error(
-            model,
-            here,
-            MODE_ALPHA[mode],
-            steps=round(duration / config.koopman.dataset.dt),
-            duration=duration,
-        )
-        if error > 1.0:
-            warnings.warn(
-                f"koopman: over the LMPC's {duration:g} s the velocity that the fitted "
-                f"{mode.name.lower()} model predicts for a held force is {error:.1f} times the "
-                "rigid body's response away from it, so it may throw the robot over; try fewer "
-                "powers (koopman.order), more koopman.dataset.rollouts or another "
-                "koopman.dataset.seed",
-                stacklevel=3,
-            )
-
-
-def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParams:
-    """Parameters from a config and its fits; the config's continuous numbers may be traced."""
-    gaits = build_gaits(config)
-    names = [g.name for g in gaits]
-    leg, bound, sideways = config.leg, config.bound, config.lateral
-    is_bound = np.array([name == "bound" for name in names])
-    foresees = cycle_nodes(gaits, config).any(axis=1)
-    mass, inertia = body_numbers(config, robot)
-    return ControllerParams(
-        robot=robot,
-        tables=_build_tables(
-            fits.model,
-            mode_settings(config.lmpc, bound, mean_force(config, mass)),
-            steps=round(config.lmpc.model_dt / config.koopman.dataset.dt),
-            horizon=config.lmpc.horizon,
-            feet=fits.feet,
-            spread=fits.spread,
-            cautious=config.lmpc.caution > 0,
-            caution=config.lmpc.caution,
-        ),
-        friction=jnp.asarray(config.lmpc.friction, float),
-        torque_fraction=jnp.asarray(config.lmpc.torque_fraction, float),
-        prediction=fits.prediction,
-        feet=fits.feet,
-        schedule=gait.build_schedule(gaits),
-        gait_times=jnp.asarray(config.gait.times),
-        gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
-        reference=_reference_tables(gaits, config, mass, inertia),
-        multiphase=multiphase_params(gaits, config, robot),
-        swing=swing.SwingParams(
-            apex=jnp.where(is_bound, bound.apex, leg.apex),
-            velocity_gain=jnp.where(is_bound, bound.velocity_gain, leg.velocity_gain),
-            offset=jnp.asarray(is_bound)[:, None] * _bound_offset(robot, config),
-            horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
-            hold_after=jnp.asarray(leg.hold_after),
-            reach_speed=jnp.asarray(leg.reach_speed),
-            kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
-            kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
-        ),
-        lateral=lateral.LateralParams(
-            roll=jnp.asarray([sideways.roll_stiffness, sideways.roll_damping]),
-            yaw=jnp.asarray([sideways.yaw_stiffness, sideways.yaw_damping]),
-            damping=jnp.asarray(sideways.damping),
-            weights=jnp.asarray(sideways.wrench_weights),
-            ridge=jnp.asarray(sideways.force_weight),
-            friction=jnp.minimum(
-                sideways.friction,
-                jnp.where(foresees, config.multiphase.friction, config.lmpc.friction),
-            ),
-            torque_fraction=jnp.minimum(
-                1.0,
-                jnp.where(foresees, config.multiphase.torque_fraction, config.lmpc.torque_fraction),
-            ),
-            foothold_gain=jnp.asarray(sideways.velocity_gain),
-        ),
-        command=Command(
-            times=jnp.asarray(config.command.times),
-            velocities=jnp.asarray(config.command.velocities),
-        ),
-        height=jnp.where(is_bound, bound.height, config.lmpc.height),
-        command_slew=jnp.asarray(config.lmpc.command_slew, float),
-        integral=jnp.stack(
-            [jnp.asarray(config.lmpc.integral_gains), jnp.asarray(config.lmpc.integral_limits)]
-        ),
-        position_slack=jnp.asarray(config.lmpc.position_slack),
-        hold_time=jnp.asarray(leg.hold_time),
-        blind_damping=jnp.asarray(leg.blind_damping),
+@partial(jax.jit, static_argnums=0)
+def _condensed(spec: ControllerSpec, params: ControllerParams) -> LmpcTables:
+    return build_tables(
+        params.fits.model,
+        params.modes,
+        steps=round(spec.model_dt / spec.model.dt),
+        horizon=spec.horizon,
+        feet=params.fits.feet,
+        spread=params.fits.spread,
+        cautious=spec.cautious,
+        caution=params.caution,
     )
 
 
-_fit_modes = jax.jit(fit_modes, static_argnames="config")
-_build_tables = jax.jit(build_tables, static_argnames=("steps", "horizon", "cautious"))
+def _double(leaf: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    return array.astype(float) if np.issubdtype(array.dtype, np.floating) else array
 
 
-def multiphase_params(
-    gaits: list[gait.Gait], config: RunConfig, robot: RobotParams
-) -> multiphase.MultiPhaseParams:
-    """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
-    chosen, bound = config.multiphase, config.bound
-    mass, inertia = body_numbers(config, robot)
-    return multiphase.MultiPhaseParams(
-        nodes=jnp.asarray(cycle_nodes(gaits, config)),
-        state_weights=jnp.asarray(chosen.state_weights),
-        input_weight=jnp.asarray(chosen.input_weight),
-        mass=jnp.asarray(mass),
-        inertia=jnp.asarray(inertia * chosen.inertia_scale),
-        friction=jnp.asarray(chosen.friction),
-        torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
-        force_x_max=jnp.asarray(chosen.force_x_max),
-        force_z=jnp.asarray([chosen.force_z_min, chosen.force_z_max]),
-        feet=jnp.asarray([bound.feet_front, -bound.feet_rear]),
-        velocity_gain=jnp.asarray(bound.velocity_gain),
-        velocity_time=jnp.asarray(chosen.velocity_time),
-        height_time=jnp.asarray(chosen.height_time),
-    )
-
-
-def _reference_tables(gaits: list[gait.Gait], config: RunConfig, mass: Any, inertia: Any) -> Array:
-    """Periodic motion of every gait at every ramp level; zero but for a bound that wants one."""
-    bound = config.bound
-    levels = 1 + max(g.ramp_cycles for g in gaits)
-    rows = jnp.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
-    for index, one in enumerate(gaits):
-        if one.name != "bound" or bound.reference != "periodic":
-            continue
-        modes = [phase.mode for phase in one.phases]
-        cycles = [
-            periodic_reference(
-                np.array(one.durations(level)),
-                modes,
-                bound.feet_front,
-                bound.feet_rear,
-                mass,
-                inertia,
-                bound.force_edge,
-            ).rows
-            for level in range(levels)
-        ]
-        rows = rows.at[index].set(jnp.stack(cycles))
-    return rows
-
-
-def _bound_offset(robot: RobotParams, config: RunConfig) -> Array:
-    """Foothold of a bound ahead of the hip, standing still, for each leg [m]."""
-    wanted = [config.bound.feet_front] * 2 + [-config.bound.feet_rear] * 2
-    return jnp.stack([jnp.asarray(one, float) for one in wanted]) - robot.hip_pos[:, 0]
+def cast(tree: Any, dtype: Any) -> Any:
+    """Numbers on the device, floats in ``dtype``, integers as int32."""
+    return jax.tree.map(lambda leaf: _as(leaf, dtype), tree)
 
 
 def _as(leaf: Any, dtype: Any) -> Array:

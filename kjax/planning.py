@@ -19,7 +19,7 @@ from kjax.legs.kinematics import PlanarState
 from kjax.mpc import multiphase
 from kjax.mpc.limits import force_limits
 from kjax.mpc.lmpc import LmpcMemory, reference_trajectory, shift_plan, solve_lmpc
-from kjax.params import ControllerParams
+from kjax.params import ControllerParams, Tables
 from kjax.spec import ControllerSpec, CycleSpec
 from kjax.types import RobotParams
 
@@ -75,7 +75,7 @@ class ForcePlan(NamedTuple):
     reference: Float[Array, "6"]
 
 
-Planner = Callable[[ControllerParams, ForceTask], ForcePlan]
+Planner = Callable[[Tables, ForceTask], ForcePlan]
 
 
 def build_planner(spec: ControllerSpec) -> Planner:
@@ -85,9 +85,9 @@ def build_planner(spec: ControllerSpec) -> Planner:
         return stance
     cycle = _build_cycle_planner(spec.cycle, spec.control_dt)
 
-    def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
-        foresees = params.multiphase.nodes[task.clock.gait].sum() > 0
-        return jax.lax.cond(foresees & task.stance.any(), cycle, stance, params, task)
+    def plan(tables: Tables, task: ForceTask) -> ForcePlan:
+        foresees = tables.params.multiphase.nodes[task.clock.gait].sum() > 0
+        return jax.lax.cond(foresees & task.stance.any(), cycle, stance, tables, task)
 
     return plan
 
@@ -98,25 +98,24 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
     family = build_family(spec.model)
     lift = family.lift
 
-    def model_here(
-        params: ControllerParams, mode: Array, start: Start
-    ) -> tuple[Array, LinearModel | None]:
+    def model_here(tables: Tables, mode: Array, start: Start) -> tuple[Array, LinearModel | None]:
         """Lifted state, and the model where that is not one of the tables."""
         if spec.model.kind == "linear":
             z = lift(None, start)
             if not spec.model.measured_feet:
                 return z, None
-            model = jax.tree.map(lambda a: a[mode], params.tables.model)
+            model = jax.tree.map(lambda a: a[mode], tables.lmpc.model)
             return z, model._replace(B=input_map(model, start.feet))
-        numbers, force, _ = jax.tree.map(lambda a: a[mode], params.prediction)
+        fits = tables.params.fits
+        numbers, force, _ = jax.tree.map(lambda a: a[mode], fits.prediction)
         if not spec.model.measured_feet:
-            start = start._replace(feet=params.feet[mode])
+            start = start._replace(feet=fits.feet[mode])
         return lift(numbers, start), operating_point(family, numbers, start, force, steps)
 
     limited = spec.friction_rows or spec.torque_rows
 
-    def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
-        clock, body = task.clock, task.body
+    def plan(tables: Tables, task: ForceTask) -> ForcePlan:
+        params, clock, body = tables.params, task.clock, task.body
         ahead = spec.model_dt * jnp.arange(1, spec.horizon + 1, dtype=task.lag.dtype)
         phase, cycle = (jnp.broadcast_to(a, ahead.shape) for a in (clock.phase, clock.cycle))
         reference = reference_trajectory(
@@ -143,17 +142,17 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         fresh = clock.elapsed < 0.5 * spec.control_dt
         last = jnp.where(fresh, 0.0, task.memory.plan[:4])
         start = Start(body.x, feet, last, rate * clock.elapsed, rate)
-        z, model = model_here(params, task.mode, start)
+        z, model = model_here(tables, task.mode, start)
         solution = solve_lmpc(
-            params.tables, task.mode, z, reference, task.memory, spec, model=model, rows=rows
+            tables.lmpc, task.mode, z, reference, task.memory, spec, model=model, rows=rows
         )
         # Out of iterations, the solver's point is feasible and no worse than its start; only
         # faulty data makes the shifted last plan the better choice.
         usable = (solution.status <= qp.Status.ITERATION_LIMIT) & task.valid
         fallback = jnp.clip(
             shift_plan(task.memory.plan, spec),
-            params.tables.lower[task.mode],
-            params.tables.upper[task.mode],
+            tables.lmpc.lower[task.mode],
+            tables.lmpc.upper[task.mode],
         )
         steps = jnp.where(usable, solution.plan, fallback)
         return ForcePlan(
@@ -174,8 +173,9 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
     # The present phase may hold one node more, part of them now and part a cycle later.
     count = spec.nodes + 1
 
-    def plan(params: ControllerParams, task: ForceTask) -> ForcePlan:
-        settings, schedule, clock, body = params.multiphase, params.schedule, task.clock, task.body
+    def plan(tables: Tables, task: ForceTask) -> ForcePlan:
+        params, clock, body = tables.params, task.clock, task.body
+        settings, schedule = params.multiphase, params.schedule
         nodes = multiphase.build_nodes(settings, schedule, clock, count, shortest)
         outlook = multiphase.predict(
             settings,

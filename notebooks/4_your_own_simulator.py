@@ -18,12 +18,12 @@ import numpy as np
 
 from kjax import RunConfig, load_config
 from kjax.controller import build_controller
+from kjax.params import condense, with_params
 from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.scene import build_model
-from kjax.types import Command
 
 config = load_config(
     RunConfig, None, {"command.times": [0.0, 0.5], "command.velocities": [0.0, 0.4]}
@@ -32,11 +32,11 @@ config = load_config(
 # %% [markdown]
 # ## The controller
 #
-# `resolve` fits the Koopman models and condenses the LMPC: a second or two, once.
+# `resolve` fits the Koopman models, `condense` builds the LMPC's tables: a second or two, once.
 
 # %%
 spec, params = resolve(config, go1.PARAMS)
-controller = build_controller(spec)
+controller, tables = build_controller(spec), condense(spec, params)
 plan, act = jax.jit(controller.plan), jax.jit(controller.act)
 
 # %% [markdown]
@@ -53,33 +53,33 @@ data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
 mujoco.mj_forward(model, data)
 
 
-def walk(params, seconds):
+def walk(tables, seconds):
     """Speed over time [m/s], sampled every 5 ms."""
-    state = controller.init(params, observe(data.qpos, data.qvel, data.sensordata))
+    state = controller.init(tables, observe(data.qpos, data.qvel, data.sensordata))
     speed = []
     for step in range(round(seconds / config.sim.sim_dt)):
         seen = observe(data.qpos, data.qvel, data.sensordata)
         if step % 5 == 0:
-            state, info = plan(params, state, seen)
+            state, info = plan(tables, state, seen)
             speed.append(float(info.x[3]))
-        state, torque = act(params, state, seen)
+        state, torque = act(tables, state, seen)
         data.ctrl[actuator] = np.asarray(torque).reshape(-1)
         mujoco.mj_step(model, data)
     return np.array(speed)
 
 
-speed = walk(params, 3.0)
+speed = walk(tables, 3.0)
 
 # %% [markdown]
 # ## Numbers are data
 #
-# Another command, another weight: replace a leaf. Nothing compiles again.
+# Another command: replace a leaf. Another weight: replace it, then `condense` again. Nothing
+# compiles again.
 
 # %%
-slower = params._replace(
-    command=Command(times=params.command.times, velocities=0.5 * params.command.velocities)
-)
-speed = np.concatenate([speed, walk(slower, 3.0)])
+command = params.command
+slower = command._replace(velocities=0.5 * command.velocities)
+speed = np.concatenate([speed, walk(with_params(tables, command=slower), 3.0)])
 plt.figure(figsize=(7, 3), layout="constrained")
 plt.plot(0.005 * np.arange(len(speed)), speed)
 plt.xlabel("time [s]")

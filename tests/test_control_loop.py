@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from kjax import control_loop
 from kjax.control_loop import PERIOD_CALLS, ControlLoop
 from kjax.controller import Controller
 from kjax.robots import go1
@@ -58,12 +59,20 @@ class Params(NamedTuple):
     robot: RobotParams = go1.PARAMS
 
 
-def loop_of(stub):
-    return ControlLoop(stub.record(), Params())
+@pytest.fixture
+def loop_of(monkeypatch):
+    """A loop around a stub in place of the controller."""
+
+    def build(stub):
+        monkeypatch.setattr(control_loop, "build_controller", lambda spec: stub.record())
+        monkeypatch.setattr(control_loop, "condense", lambda spec, params: params)
+        return ControlLoop(None, Params())
+
+    return build
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32, list])
-def test_the_first_torque_is_of_the_first_sample(kind):
+def test_the_first_torque_is_of_the_first_sample(loop_of, kind):
     """All is compiled when the loop is made: a robot does not wait for that on its feet."""
     stub = Stub()
     loop = loop_of(stub)
@@ -75,14 +84,14 @@ def test_the_first_torque_is_of_the_first_sample(kind):
     assert stub.traced == 3
 
 
-def test_it_plans_at_the_control_rate_whatever_clock_it_is_given():
+def test_it_plans_at_the_control_rate_whatever_clock_it_is_given(loop_of):
     for start in (0.0, 1.7e9 * 1e-3):  # a computer's uptime
         loop = loop_of(Stub())
         plans = [loop.step(sample(), start + 0.001 * i)[0, 0] for i in range(20)]
         assert plans == [1] * 5 + [2] * 5 + [3] * 5 + [4] * 5
 
 
-def test_after_a_pause_it_plans_at_once_and_goes_on_at_its_rate():
+def test_after_a_pause_it_plans_at_once_and_goes_on_at_its_rate(loop_of):
     loop = loop_of(Stub())
     for i in range(4):
         loop.step(sample(), 0.001 * i)
@@ -91,7 +100,7 @@ def test_after_a_pause_it_plans_at_once_and_goes_on_at_its_rate():
 
 
 @pytest.mark.parametrize("time", [0.003, 0.002, np.nan])
-def test_a_time_that_does_not_run_on_is_refused(time):
+def test_a_time_that_does_not_run_on_is_refused(loop_of, time):
     loop = loop_of(Stub())
     loop.step(sample(), 0.003)
     with pytest.raises(ValueError, match=r"time must run on from 0\.003 s, got .* reset\(\)"):
@@ -100,7 +109,7 @@ def test_a_time_that_does_not_run_on_is_refused(time):
     assert loop.step(sample(), 0.0)[0, 0] == 1
 
 
-def test_another_rate_than_the_controllers_is_told_once():
+def test_another_rate_than_the_controllers_is_told_once(loop_of):
     loop = loop_of(Stub())
     for i in range(PERIOD_CALLS):
         loop.step(sample(), 0.005 * i)
@@ -113,13 +122,13 @@ def test_another_rate_than_the_controllers_is_told_once():
     assert told == []
 
 
-def test_a_flag_that_is_no_number_does_not_stop_a_walk():
+def test_a_flag_that_is_no_number_does_not_stop_a_walk(loop_of):
     loop = loop_of(Stub())
     loop.step(sample(), 0.0)
     assert loop.step(sample(contact=np.array([1.0, np.nan, 1.0, 1.0])), 0.001).shape == (4, 3)
 
 
-def test_pauses_are_no_rate():
+def test_pauses_are_no_rate(loop_of):
     loop = loop_of(Stub())
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
@@ -128,7 +137,7 @@ def test_pauses_are_no_rate():
     assert told == []
 
 
-def test_a_jittering_clock_is_not_complained_of():
+def test_a_jittering_clock_is_not_complained_of(loop_of):
     loop, rng = loop_of(Stub()), np.random.default_rng(0)
     times = np.cumsum(0.001 * rng.uniform(0.5, 1.5, 200))
     with warnings.catch_warnings(record=True) as told:
@@ -138,7 +147,7 @@ def test_a_jittering_clock_is_not_complained_of():
     assert told == []
 
 
-def test_a_wrong_shape_is_refused_at_every_call():
+def test_a_wrong_shape_is_refused_at_every_call(loop_of):
     loop = loop_of(Stub())
     loop.step(sample(), 0.0)
     with pytest.raises(ValueError, match=r"observation\.joint_pos: got shape \(12,\), wanted"):

@@ -14,8 +14,8 @@ from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, LmpcConfig
 from kjax.koopman import families, prediction, storage
 from kjax.legs.base import build_base
 from kjax.mpc.lmpc import reference_trajectory, solve_lmpc
-from kjax.params import build_params
-from kjax.resolve import controller_spec
+from kjax.params import condense, with_params
+from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
 from kjax.types import Leg, Mode
 from kjax.walkable import build_gaits
@@ -52,8 +52,8 @@ def controller():
 
 
 @pytest.fixture(scope="module")
-def params():
-    return build_params(CONFIG, go1.PARAMS)
+def tables():
+    return condense(*resolve(CONFIG, go1.PARAMS))
 
 
 def bounding(**changes):
@@ -66,8 +66,8 @@ def bounding(**changes):
 
 
 @pytest.fixture(scope="module")
-def bound_params():
-    return build_params(bounding(), go1.PARAMS)
+def bound_tables():
+    return condense(*resolve(bounding(), go1.PARAMS))
 
 
 @pytest.fixture(scope="module")
@@ -80,15 +80,15 @@ def act(controller):
     return jax.jit(controller.act)
 
 
-def after_first_plan(controller, params, plan, observation=None):
+def after_first_plan(controller, tables, plan, observation=None):
     observation = standing() if observation is None else observation
-    return plan(params, controller.init(params, observation), observation)
+    return plan(tables, controller.init(tables, observation), observation)
 
 
 def test_the_first_plan_enters_the_first_phase_with_one_diagonal_on_the_ground(
-    controller, params, plan
+    controller, tables, plan
 ):
-    state, info = after_first_plan(controller, params, plan)
+    state, info = after_first_plan(controller, tables, plan)
     assert int(state.clock.phase) == 0
     assert float(state.clock.elapsed) == 0.0
     assert state.stance.tolist() == [True, False, False, True]
@@ -96,8 +96,8 @@ def test_the_first_plan_enters_the_first_phase_with_one_diagonal_on_the_ground(
     assert int(info.status) == qp.Status.SOLVED
 
 
-def test_swing_legs_get_no_force_and_stance_legs_carry_about_the_weight(controller, params, plan):
-    state, _ = after_first_plan(controller, params, plan)
+def test_swing_legs_get_no_force_and_stance_legs_carry_about_the_weight(controller, tables, plan):
+    state, _ = after_first_plan(controller, tables, plan)
     force = np.asarray(state.force)
     assert (force[[Leg.FL, Leg.RR]] == 0.0).all()
     weight = go1.PARAMS.mass * 9.81
@@ -105,24 +105,24 @@ def test_swing_legs_get_no_force_and_stance_legs_carry_about_the_weight(controll
     assert force[:, 1].sum() == pytest.approx(weight, rel=0.01)
 
 
-def test_a_lower_body_asks_for_more_force_and_a_slow_one_for_a_push(controller, params, plan):
-    base = np.asarray(after_first_plan(controller, params, plan)[0].force).sum(axis=0)
+def test_a_lower_body_asks_for_more_force_and_a_slow_one_for_a_push(controller, tables, plan):
+    base = np.asarray(after_first_plan(controller, tables, plan)[0].force).sum(axis=0)
     low = standing(com_height=0.265)
-    assert np.asarray(after_first_plan(controller, params, plan, low)[0].force).sum(axis=0)[1] > (
+    assert np.asarray(after_first_plan(controller, tables, plan, low)[0].force).sum(axis=0)[1] > (
         base[1] + 5.0
     )
     slow = standing(base_vel=[-0.1, 0.0, 0.0])
-    assert np.asarray(after_first_plan(controller, params, plan, slow)[0].force).sum(axis=0)[0] > (
+    assert np.asarray(after_first_plan(controller, tables, plan, slow)[0].force).sum(axis=0)[0] > (
         base[0] + 5.0
     )
 
 
-def test_stance_torques_press_with_the_planned_force(controller, params, plan, act):
+def test_stance_torques_press_with_the_planned_force(controller, tables, plan, act):
     """Virtual work against the planned force, by finite differences of the foot position."""
     observation = standing()
-    state, _ = after_first_plan(controller, params, plan, observation)
+    state, _ = after_first_plan(controller, tables, plan, observation)
     state = state._replace(force=jnp.tile(jnp.array([10.0, 60.0]), (4, 1)))
-    _, torque = act(params, state, observation)
+    _, torque = act(tables, state, observation)
 
     def foot(q1, q2):
         l1, l2 = go1.THIGH_LENGTH, go1.CALF_LENGTH
@@ -140,10 +140,10 @@ def test_stance_torques_press_with_the_planned_force(controller, params, plan, a
         )
 
 
-def test_torques_stay_within_the_robots_limits(controller, params, plan, act):
-    state, _ = after_first_plan(controller, params, plan)
+def test_torques_stay_within_the_robots_limits(controller, tables, plan, act):
+    state, _ = after_first_plan(controller, tables, plan)
     wild = standing(joint_pos=np.tile([0.8, 4.0, -0.9], (4, 1)), joint_vel=np.full((4, 3), 30.0))
-    _, torque = act(params, state, wild)
+    _, torque = act(tables, state, wild)
     assert (np.abs(torque) <= go1.PARAMS.torque_limit).all()
     assert (np.abs(torque) == go1.PARAMS.torque_limit).any()
 
@@ -151,11 +151,11 @@ def test_torques_stay_within_the_robots_limits(controller, params, plan, act):
 @pytest.mark.parametrize("config", [CONFIG, bounding()], ids=["trot", "bound"])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_state_keeps_its_tree_shapes_and_types(controller, dtype, config):
-    params = build_params(config, go1.PARAMS, dtype=dtype)
+    tables = condense(*resolve(config, go1.PARAMS), dtype=dtype)
     observation = standing(dtype)
-    state = jax.eval_shape(controller.init, params, observation)
-    planned, _ = jax.eval_shape(controller.plan, params, state, observation)
-    acted, torque = jax.eval_shape(controller.act, params, planned, observation)
+    state = jax.eval_shape(controller.init, tables, observation)
+    planned, _ = jax.eval_shape(controller.plan, tables, state, observation)
+    acted, torque = jax.eval_shape(controller.act, tables, planned, observation)
     chex.assert_trees_all_equal_shapes_and_dtypes(state, planned, acted)
     assert torque.dtype == dtype
     assert all(
@@ -165,58 +165,61 @@ def test_state_keeps_its_tree_shapes_and_types(controller, dtype, config):
     )
 
 
-def test_float32_and_float64_agree_on_the_plan(controller, params, plan):
-    single = build_params(CONFIG, go1.PARAMS, dtype=jnp.float32)
+def test_float32_and_float64_agree_on_the_plan(controller, tables, plan):
+    single = condense(*resolve(CONFIG, go1.PARAMS), dtype=jnp.float32)
     pitched = dict(base_vel=[0.03, 0.0, -0.02], base_ang_vel=[0.0, 0.2, 0.0])
-    full, _ = after_first_plan(controller, params, plan, standing(**pitched))
+    full, _ = after_first_plan(controller, tables, plan, standing(**pitched))
     half, _ = after_first_plan(controller, single, plan, standing(jnp.float32, **pitched))
     # 0.02 N of about 60: gains of up to 3e3 N/m on positions that float32 resolves to 3e-8 m,
     # times the 1e-6 residual that the QP is solved to
     np.testing.assert_allclose(half.force, full.force, atol=0.02)
 
 
-def test_one_trace_serves_all_gaits_commands_and_phases(controller, params):
+def test_one_trace_serves_all_gaits_commands_and_phases(controller, tables):
     counted = jax.jit(chex.assert_max_traces(controller.plan, n=1))
     observation = standing()
-    state = controller.init(params, observation)
+    state = controller.init(tables, observation)
     for tick in range(120):  # more than a whole stride of 0.5 s
-        state, info = counted(params, state, observation)
+        state, info = counted(tables, state, observation)
         assert int(info.status) == qp.Status.SOLVED, tick
     for gait, mode in enumerate((Mode.TROT, Mode.FRONT, Mode.STAND)):
-        other = params._replace(
+        other = with_params(
+            tables,
             gaits=jnp.asarray([gait], jnp.int32),
-            command=params.command._replace(velocities=params.command.velocities + 0.1),
+            command=tables.params.command._replace(
+                velocities=tables.params.command.velocities + 0.1
+            ),
         )
         state, info = counted(other, controller.init(other, observation), observation)
         assert int(info.mode) == mode
         np.testing.assert_array_equal(state.stance, STANCE[mode])
 
 
-def test_trot_swaps_diagonals_every_stance_time(controller, params, plan):
+def test_trot_swaps_diagonals_every_stance_time(controller, tables, plan):
     observation = standing()
-    state = controller.init(params, observation)
+    state = controller.init(tables, observation)
     pattern = []
     for _ in range(200):
-        state, _ = plan(params, state, observation)
+        state, _ = plan(tables, state, observation)
         pattern.append(bool(state.stance[Leg.FR]))
     # 0.25 s at 200 Hz
     assert pattern == ([True] * 50 + [False] * 50) * 2
 
 
-def plans(controller, params, plan, ticks, observation=None):
+def plans(controller, tables, plan, ticks, observation=None):
     """States and infos of ``ticks`` plans for a robot that stands still."""
     observation = standing() if observation is None else observation
-    state, results = controller.init(params, observation), []
+    state, results = controller.init(tables, observation), []
     for _ in range(ticks):
-        state, info = plan(params, state, observation)
+        state, info = plan(tables, state, observation)
         results.append((state, info))
     return jax.device_get(jax.tree.map(lambda *leaves: np.stack(leaves), *results))
 
 
 @pytest.fixture(scope="module")
-def two_bounds(controller, bound_params, plan):
+def two_bounds(controller, bound_tables, plan):
     """0.7 s, two cycles."""
-    return plans(controller, bound_params, plan, 140)
+    return plans(controller, bound_tables, plan, 140)
 
 
 # 0.10, 0.10, 0.05 and 0.10 s at 200 Hz
@@ -251,8 +254,8 @@ def test_legs_swing_from_the_end_of_their_stance_to_its_next_beginning(two_bound
 
 
 def test_a_bound_ramps_up_by_its_flights(controller, plan):
-    params = build_params(bounding(**{"bound.ramp_start": 0.5}), go1.PARAMS)
-    states, infos = plans(controller, params, plan, 50 + 52 + 54)
+    tables = condense(*resolve(bounding(**{"bound.ramp_start": 0.5}), go1.PARAMS))
+    states, infos = plans(controller, tables, plan, 50 + 52 + 54)
     # Half of 20 ticks of flight, and a tick more in each of 10 cycles.
     expected = []
     for flight in (10, 11, 12):
@@ -260,14 +263,14 @@ def test_a_bound_ramps_up_by_its_flights(controller, plan):
         expected += [Mode.REAR] * 10 + [Mode.FLIGHT] * flight
     assert infos.mode.tolist() == expected
     # The reference of each cycle is the one of its own flights: higher every time.
-    assert (np.diff(np.ptp(np.asarray(params.reference)[1, ..., 0], axis=(1, 2))) > 0).all()
+    assert (np.diff(np.ptp(np.asarray(tables.params.reference)[1, ..., 0], axis=(1, 2))) > 0).all()
     for cycle, begin in enumerate((0, 50, 102)):
         assert states.clock.cycle[begin] == cycle
         # At the cycle's first tick the reference is 1 ms into the first row: v_z falls by less
         # than 10 m/s^2 times that, and differs by more than that between the cycles.
-        first = np.asarray(params.reference)[1, cycle, 0, 0, 2]
+        first = np.asarray(tables.params.reference)[1, cycle, 0, 0, 2]
         assert infos.reference[begin, 4] == pytest.approx(first, abs=0.0099)
-        assert abs(first - np.asarray(params.reference)[1, cycle + 1, 0, 0, 2]) > 0.0200
+        assert abs(first - np.asarray(tables.params.reference)[1, cycle + 1, 0, 0, 2]) > 0.0200
 
 
 # A robot that is high and flies up wants no force at all, one that is low and falls wants more
@@ -283,7 +286,7 @@ BOX = {"lmpc.friction": np.inf, "lmpc.torque_fraction": np.inf}  # the paper's: 
 def box():
     """Controller, compiled plan and parameters of a bound without friction and torque rows."""
     own = build_controller(controller_spec(bounding(**BOX)))
-    return own, jax.jit(own.plan), build_params(bounding(**BOX), go1.PARAMS)
+    return own, jax.jit(own.plan), condense(*resolve(bounding(**BOX), go1.PARAMS))
 
 
 @pytest.mark.parametrize(
@@ -296,15 +299,15 @@ def box():
     ],
 )
 def test_each_mode_presses_within_its_own_limits_and_reaches_them(box, mode, least, most, sideways):
-    controller, plan, bound_params = box
+    controller, plan, bound_tables = box
     index = {Mode.TROT: 0, Mode.FRONT: 1, Mode.REAR: 1, Mode.STAND: 2}[mode]
-    params = bound_params._replace(gaits=jnp.asarray([index], jnp.int32))
+    tables = with_params(bound_tables, gaits=jnp.asarray([index], jnp.int32))
     for name, limit in (("least", least), ("most", most)):
         observation = standing(**EAGER[name])
-        state = controller.init(params, observation)
+        state = controller.init(tables, observation)
         if mode == Mode.REAR:  # the phase after the first flight
             state = state._replace(clock=state.clock._replace(phase=jnp.asarray(2, jnp.int32)))
-        state, info = plan(params, state, observation)
+        state, info = plan(tables, state, observation)
         assert int(info.mode) == mode
         force, stance = np.asarray(state.force), np.asarray(state.stance)
         np.testing.assert_array_equal(stance, STANCE[mode])
@@ -315,11 +318,11 @@ def test_each_mode_presses_within_its_own_limits_and_reaches_them(box, mode, lea
 
 
 def test_a_bound_s_reference_is_the_body_s_own_motion_at_the_clock_s_place(
-    two_bounds, bound_params
+    two_bounds, bound_tables
 ):
     """Level in the mean: the body turns and rises, and the reference with it, tick by tick."""
     _, infos = two_bounds
-    table = np.asarray(bound_params.reference)[1, 0]
+    table = np.asarray(bound_tables.params.reference)[1, 0]
     now = 0.005 * np.arange(70)
     rows = []
     begins = np.cumsum([0.0, 0.10, 0.10, 0.05, 0.10])
@@ -335,19 +338,19 @@ def test_a_bound_s_reference_is_the_body_s_own_motion_at_the_clock_s_place(
     assert np.ptp(expected[:, 1]) > 0.05
 
 
-def test_only_a_bound_has_a_periodic_reference_and_only_if_it_is_asked_for(bound_params):
-    reference = np.asarray(bound_params.reference)
+def test_only_a_bound_has_a_periodic_reference_and_only_if_it_is_asked_for(bound_tables):
+    reference = np.asarray(bound_tables.params.reference)
     names = ("trot", "bound", "stand")
     for name, rows in zip(names, reference, strict=True):
         assert rows.any() == (name == "bound")
-    constant = build_params(bounding(**{"bound.reference": "constant"}), go1.PARAMS)
+    constant = condense(*resolve(bounding(**{"bound.reference": "constant"}), go1.PARAMS))
     assert constant.reference.shape == reference.shape
     np.testing.assert_array_equal(constant.reference, 0.0)
 
 
 def test_a_constant_reference_is_level_and_at_rest_in_every_phase(controller, plan):
-    params = build_params(bounding(**{"bound.reference": "constant"}), go1.PARAMS)
-    _, infos = plans(controller, params, plan, 70)
+    tables = condense(*resolve(bounding(**{"bound.reference": "constant"}), go1.PARAMS))
+    _, infos = plans(controller, tables, plan, 70)
     assert infos.mode.tolist() == CYCLE
     level = np.tile([0.27, 0.0, 0.0, 0.0, 0.0], (70, 1))
     np.testing.assert_array_equal(infos.reference[:, 1:], level)
@@ -364,7 +367,7 @@ def test_gaits_are_switched_at_their_times_in_one_trace(controller):
     chosen |= {"gait.times": [0.0, 0.1, 0.18, 0.3, 0.53], "gait.stance_time": 0.22}
     config = bounding(**chosen)
     counted = jax.jit(chex.assert_max_traces(controller.plan, n=1))
-    states, infos = plans(controller, build_params(config, go1.PARAMS), counted, 170)
+    states, infos = plans(controller, condense(*resolve(config, go1.PARAMS)), counted, 170)
     assert (infos.status == qp.Status.SOLVED).all()
     gaits = [0] * 20 + [1] * 20 + [0] * 20 + [1] * 90 + [2] * 20
     assert states.clock.gait.tolist() == gaits
@@ -390,10 +393,16 @@ def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait
     assert landing.leave_when_done
     assert [g.leave_when_done for g in others] == [False, True, False]
     # One number for each gait, and the landing is at the trot's height.
-    params = build_params(config, go1.PARAMS)
-    assert len(gaits) == len(params.height) == len(params.swing.apex) == len(params.reference) == 4
-    np.testing.assert_array_equal(params.height[3], config.lmpc.height)
-    np.testing.assert_array_equal(params.schedule.leave_through, [0, 3, 2, 3])
+    tables = condense(*resolve(config, go1.PARAMS))
+    assert (
+        len(gaits)
+        == len(tables.params.height)
+        == len(tables.params.swing.apex)
+        == len(tables.params.reference)
+        == 4
+    )
+    np.testing.assert_array_equal(tables.params.height[3], config.lmpc.height)
+    np.testing.assert_array_equal(tables.params.schedule.leave_through, [0, 3, 2, 3])
 
 
 @pytest.mark.parametrize(
@@ -412,10 +421,10 @@ def test_the_reference_velocity_follows_the_command_at_its_largest_rate(
     """From rest to -0.5 m/s at 200 Hz, and the reference position is its integral."""
     chosen = {"command.velocities": [-0.5] * 5, "lmpc.command_slew": slew}
     chosen |= {"lmpc.position_slack": 1.0}
-    params = build_params(
-        load_config(RunConfig, None, {"sim.base": "planar", **chosen}), go1.PARAMS
+    tables = condense(
+        *resolve(load_config(RunConfig, None, {"sim.base": "planar", **chosen}), go1.PARAMS)
     )
-    states, infos = plans(controller, params, plan, 30)
+    states, infos = plans(controller, tables, plan, 30)
     ramp = -0.5 * np.minimum(np.arange(1, 31) / ticks, 1.0)
     # Sums of up to 30 terms, rounded.
     np.testing.assert_allclose(states.velocity, ramp, rtol=0, atol=1e-14)
@@ -428,9 +437,9 @@ def test_the_reference_velocity_follows_the_command_at_its_largest_rate(
 def test_heights_are_measured_from_the_stance_feet_wherever_zero_is(controller, plan, rise):
     """In stance, then in the air, where the ground of the last stance holds on."""
     config = bounding(**{"bound.reference": "constant"})
-    params = build_params(config, go1.PARAMS)
+    tables = condense(*resolve(config, go1.PARAMS))
     high = standing(base_pos=standing().base_pos + np.array([0.0, 0.0, rise]))
-    _, infos = plans(controller, params, plan, 30, high)
+    _, infos = plans(controller, tables, plan, 30, high)
     assert set(infos.mode.tolist()) == {Mode.FRONT, Mode.FLIGHT}
     # Rounding of the legs' kinematics.
     np.testing.assert_allclose(infos.reference[:, 1], 0.27, rtol=0, atol=1e-12)
@@ -438,21 +447,21 @@ def test_heights_are_measured_from_the_stance_feet_wherever_zero_is(controller, 
     np.testing.assert_array_equal(infos.x[:, 0], 0.0)
 
 
-def test_footholds_of_a_bound_lie_closer_under_the_body(controller, bound_params, plan):
+def test_footholds_of_a_bound_lie_closer_under_the_body(controller, bound_tables, plan):
     """Standing, the feet of a swing end as far from the trunk's middle as the config says."""
-    offset = np.asarray(bound_params.swing.offset)
+    offset = np.asarray(bound_tables.params.swing.offset)
     hips = np.asarray(go1.PARAMS.hip_pos)[:, 0]
     np.testing.assert_array_equal(offset[[0, 2]], 0.0)
     # Rounding of a sum.
     np.testing.assert_allclose(hips + offset[1], [0.075, 0.075, -0.148, -0.148], rtol=1e-15)
-    np.testing.assert_array_equal(bound_params.swing.apex, [0.06, 0.064, 0.06])
-    np.testing.assert_array_equal(bound_params.swing.velocity_gain, [0.03, 0.075, 0.03])
+    np.testing.assert_array_equal(bound_tables.params.swing.apex, [0.06, 0.064, 0.06])
+    np.testing.assert_array_equal(bound_tables.params.swing.velocity_gain, [0.03, 0.075, 0.03])
 
 
-def test_the_model_of_a_bound_stands_where_its_feet_do(bound_params):
+def test_the_model_of_a_bound_stands_where_its_feet_do(bound_tables):
     """Two legs 0.075 m ahead or 0.148 m behind; the other modes stand at the rigid body's feet."""
     B = (
-        float(go1.PARAMS.pitch_inertia) / 1e-3 * np.asarray(bound_params.tables.model.B)[:, 6]
+        float(go1.PARAMS.pitch_inertia) / 1e-3 * np.asarray(bound_tables.params.fits.model.B)[:, 6]
     )  # moment per force
     ahead = {
         Mode.FRONT: [2 * 0.075, 0.0],
@@ -470,16 +479,16 @@ def test_the_model_of_a_bound_stands_where_its_feet_do(bound_params):
         assert 0.27 - go1.FOOT_RADIUS - 1e-9 <= B[mode, column] / 2 <= 0.27 + 1e-9
 
 
-def test_a_bound_s_feet_swing_to_their_own_footholds(controller, bound_params, plan, act):
+def test_a_bound_s_feet_swing_to_their_own_footholds(controller, bound_tables, plan, act):
     """The same tick of a swing, with the apex and the foothold of either gait, by hand."""
     observation = standing()._replace(contact=jnp.zeros(4, bool))
-    state = controller.init(bound_params, observation)
+    state = controller.init(bound_tables, observation)
     for _ in range(20 + 1):  # the first flight
-        state, info = plan(bound_params, state, observation)
+        state, info = plan(bound_tables, state, observation)
     assert int(info.mode) == Mode.FLIGHT
     # At the end of the swing each foot is to be on its foothold, at rest.
     swing = state.swing._replace(elapsed=jnp.full(4, 0.25), duration=jnp.full(4, 0.25))
-    _, torque = act(bound_params, state._replace(swing=swing), observation)
+    _, torque = act(bound_tables, state._replace(swing=swing), observation)
     feet = np.asarray(observation.base_pos)[0] + np.array([0.075, 0.075, -0.148, -0.148])
     expected = []
     for leg in Leg:
@@ -501,8 +510,10 @@ def knee_backward(foot):
     return np.array([lean - np.arctan2(l2 * np.sin(knee), l1 + l2 * np.cos(knee)), knee])
 
 
-def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller, params, plan):
-    stepped = params._replace(command=params.command._replace(velocities=jnp.full(5, 0.4)))
+def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller, tables, plan):
+    stepped = with_params(
+        tables, command=tables.params.command._replace(velocities=jnp.full(5, 0.4))
+    )
     state = controller.init(stepped, standing())
     velocities = []
     for _ in range(30):
@@ -515,28 +526,28 @@ def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_non_finite_observation_is_reported_and_spreads_nowhere(
-    controller, params, plan, act, bad
+    controller, tables, plan, act, bad
 ):
     good = standing()
-    state, _ = after_first_plan(controller, params, plan, good)
+    state, _ = after_first_plan(controller, tables, plan, good)
     broken = good._replace(joint_vel=good.joint_vel.at[2, 1].set(bad))
-    state, info = plan(params, state, broken)
+    state, info = plan(tables, state, broken)
     assert int(info.status) == qp.Status.NON_FINITE
-    state, torque = act(params, state, broken)
+    state, torque = act(tables, state, broken)
     assert (np.asarray(torque) == 0.0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
-    state, info = plan(params, state, good)
+    state, info = plan(tables, state, good)
     assert int(info.status) == qp.Status.SOLVED
 
 
-def test_a_batch_of_robots_equals_single_ones(controller, params, plan):
+def test_a_batch_of_robots_equals_single_ones(controller, tables, plan):
     shifts = jnp.linspace(-0.01, 0.01, 5)
     batch = jax.vmap(lambda dz: standing(base_pos=jnp.array([0.0, 0.0, 0.285]) + dz))(shifts)
-    states = jax.vmap(controller.init, in_axes=(None, 0))(params, batch)
-    together, _ = jax.jit(jax.vmap(controller.plan, in_axes=(None, 0, 0)))(params, states, batch)
+    states = jax.vmap(controller.init, in_axes=(None, 0))(tables, batch)
+    together, _ = jax.jit(jax.vmap(controller.plan, in_axes=(None, 0, 0)))(tables, states, batch)
     for i in range(5):
         alone, _ = plan(
-            params,
+            tables,
             jax.tree.map(lambda a, i=i: a[i], states),
             jax.tree.map(lambda a, i=i: a[i], batch),
         )
@@ -549,17 +560,19 @@ def test_measured_feet_and_fixed_feet_agree_where_the_feet_are_nominal(controlle
     config = load_config(RunConfig, None, {"sim.base": "planar", "koopman.feet": "measured"})
     measured = build_controller(controller_spec(config))
     low = standing(base_pos=[0.0, 0.0, float(standing().base_pos[2]) - 0.014])
-    ours, info = jax.jit(measured.step)(*_start(measured, build_params(config, go1.PARAMS), low))[
-        ::2
-    ]
-    theirs = jax.jit(controller.step)(*_start(controller, build_params(CONFIG, go1.PARAMS), low))[0]
+    ours, info = jax.jit(measured.step)(
+        *_start(measured, condense(*resolve(config, go1.PARAMS)), low)
+    )[::2]
+    theirs = jax.jit(controller.step)(
+        *_start(controller, condense(*resolve(CONFIG, go1.PARAMS)), low)
+    )[0]
     assert int(info.status) == qp.Status.SOLVED
     # 1.5 N of 60: B is fitted on other data, and the contact points are a few mm apart
     np.testing.assert_allclose(ours.force, theirs.force, atol=1.5)
 
 
-def _start(controller, params, observation):
-    return params, controller.init(params, observation), observation
+def _start(controller, tables, observation):
+    return tables, controller.init(tables, observation), observation
 
 
 def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_path):
@@ -580,23 +593,23 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         lmpc=LmpcConfig(model_dt=0.02, horizon=5),
     )
     own = build_controller(controller_spec(config))
-    params = build_params(config, go1.PARAMS)
+    tables = condense(*resolve(config, go1.PARAMS))
     observation = standing()
-    state = own.init(params, observation)
+    state = own.init(tables, observation)
     plan = jax.jit(own.plan)
     before = []
     for _ in range(3):
         before.append(state)
-        state, info = plan(params, state, observation)
+        state, info = plan(tables, state, observation)
         assert info.status == qp.Status.SOLVED
     last = before[-1]
     stance_time = config.gait.stance_time
-    view = build_base(config.sim.base).view(params.robot, None, observation)
+    view = build_base(config.sim.base).view(tables.params.robot, None, observation)
     feet = np.array(view.planar.feet - view.planar.x[:2]).reshape(2, 2, 2)
     feet[..., 1] -= go1.FOOT_RADIUS
     ends = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
     family = prediction.build_family(prediction.model_spec(config.koopman))
-    numbers, force, _ = jax.tree.map(lambda a: a[Mode.TROT], params.prediction)
+    numbers, force, _ = jax.tree.map(lambda a: a[Mode.TROT], tables.params.fits.prediction)
 
     def forces(u_before, elapsed):
         start = families.Start(
@@ -606,13 +619,13 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         model = families.operating_point(family, numbers, start, force, 4)
         ahead = config.lmpc.model_dt * jnp.arange(1, 6)
         reference = reference_trajectory(
-            position=state.lag, velocity=state.velocity, height=params.height[0],
+            position=state.lag, velocity=state.velocity, height=tables.params.height[0],
             periodic=jnp.zeros((5, 4)), ahead=ahead,
         )  # fmt: skip
         z = family.lift(numbers, start)
         memory = last.memory
         solved = solve_lmpc(
-            params.tables,
+            tables.lmpc,
             jnp.asarray(Mode.TROT),
             z,
             reference,
@@ -634,23 +647,23 @@ def test_a_fit_that_misjudges_forces_is_warned_of_and_a_good_one_is_not(recwarn)
     """Seed 1's fourth powers of omega, contact points varied, answer forces 4.9 times wrong."""
     lmpc = LmpcConfig(model_dt=0.02, horizon=10)
     config = dataclasses.replace(CONFIG, lmpc=lmpc, koopman=KoopmanConfig(feet="measured", order=2))
-    build_params(config, go1.PARAMS)
+    condense(*resolve(config, go1.PARAMS))
     assert not [w for w in recwarn if "koopman" in str(w.message)]
     faulty = dataclasses.replace(config, koopman=KoopmanConfig(feet="measured"))
     with pytest.warns(UserWarning, match=r"trot model predicts for a held force is 4\.9 times"):
-        build_params(faulty, go1.PARAMS)
+        condense(*resolve(faulty, go1.PARAMS))
 
 
-def test_a_flag_that_contradicts_the_kinematics_is_told_of_its_leg(controller, params, plan, act):
+def test_a_flag_that_contradicts_the_kinematics_is_told_of_its_leg(controller, tables, plan, act):
     """A leg that presses without contact; its flag comes on again, and is trusted after a while."""
     silent = standing()._replace(contact=jnp.asarray([False, True, True, True]))
-    state, told = controller.init(params, standing()), []
+    state, told = controller.init(tables, standing()), []
     for tick in range(100):
         seen = silent if tick < 40 else standing()
-        state, info = plan(params, state, seen)
+        state, info = plan(tables, state, seen)
         told.append(np.asarray(info.contact_fault))
         for _ in range(5):
-            state, _ = act(params, state, seen)
+            state, _ = act(tables, state, seen)
     # FR stands in the first 0.25 s; a fault counts from 50 ms on, averaged over 0.5 s.
     assert not np.any(told[:10])
     assert told[30].tolist() == [True, False, False, False]

@@ -9,8 +9,8 @@ import pytest
 
 from kjax import Observation, build_controller, load_config, qp
 from kjax.config import RunConfig
-from kjax.params import build_params
-from kjax.resolve import controller_spec
+from kjax.params import condense, with_params
+from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
 from kjax.types import Leg
 
@@ -19,8 +19,8 @@ FREE = RunConfig()
 
 
 @pytest.fixture(scope="module")
-def params():
-    return build_params(FREE, go1.PARAMS)
+def tables():
+    return condense(*resolve(FREE, go1.PARAMS))
 
 
 @pytest.fixture(scope="module")
@@ -70,39 +70,39 @@ def seen_from(observation, yaw, shift):
     )
 
 
-def torques(controller, params, observations, ticks=3):
+def torques(controller, tables, observations, ticks=3):
     """Torques of a short history: one plan and one act for each observation."""
-    state = controller.init(params, observations[0])
+    state = controller.init(tables, observations[0])
     out = []
     for observation in observations[:ticks]:
-        state, info = controller.plan(params, state, observation)
+        state, info = controller.plan(tables, state, observation)
         assert int(info.status) == qp.Status.SOLVED
-        state, torque = controller.act(params, state, observation)
+        state, torque = controller.act(tables, state, observation)
         out.append(np.asarray(torque))
     return np.stack(out), state
 
 
 @pytest.mark.parametrize(("yaw", "shift"), [(0.0, (3.0, -2.0)), (1.0, (0, 0)), (-2.8, (-1.0, 4.0))])
-def test_neither_place_nor_heading_at_the_start_matters(free, params, yaw, shift):
+def test_neither_place_nor_heading_at_the_start_matters(free, tables, yaw, shift):
     history = [disturbed(seed) for seed in range(3)]
-    ours, _ = torques(free, params, history)
-    theirs, _ = torques(free, params, [seen_from(o, yaw, shift) for o in history])
+    ours, _ = torques(free, tables, history)
+    theirs, _ = torques(free, tables, [seen_from(o, yaw, shift) for o in history])
     assert np.abs(ours).max() > 5.0
     # No position enters; turning the vectors rounds them, times gains of up to 1e4.
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
 
 
-def test_a_turn_after_the_start_is_turned_back(free, params):
+def test_a_turn_after_the_start_is_turned_back(free, tables):
     """Yawed to the left, then to the right: the moment of the stance feet on the trunk opposes."""
     level = disturbed(0, planar=True)._replace(base_ang_vel=jnp.zeros(3), contact=jnp.ones(4, bool))
     # What the friction cone leaves of it is tested in tests/legs/test_lateral.py.
-    params = params._replace(lateral=params.lateral._replace(friction=jnp.full(3, 1e6)))
+    tables = with_params(tables, lateral=tables.params.lateral._replace(friction=jnp.full(3, 1e6)))
     for turned in (0.1, -0.1):
-        state = free.init(params, level)
-        state, _ = free.plan(params, state, level)
+        state = free.init(tables, level)
+        state, _ = free.plan(tables, state, level)
         there = seen_from(level, turned, (0.0, 0.0))
-        _, torque = free.act(params, state, there)
-        _, straight = free.act(params, state, level)
+        _, torque = free.act(tables, state, there)
+        _, straight = free.act(tables, state, level)
         moment = yaw_moment(there, torque, state.stance) - yaw_moment(level, straight, state.stance)
         # -20 N m/rad on 0.1 rad; two feet on a line give it but for the forces' own weight.
         assert moment == pytest.approx(-20.0 * turned, abs=0.4)
@@ -128,14 +128,15 @@ def yaw_moment(observation, torque, stance):
     return total
 
 
-def test_without_a_regulator_a_planar_state_gives_the_planar_controller_s_torques(free, params):
-    inactive = params._replace(
-        lateral=params.lateral._replace(weights=jnp.zeros(6), friction=jnp.full(3, 1e6))
+def test_without_a_regulator_a_planar_state_gives_the_planar_controller_s_torques(free, tables):
+    inactive = with_params(
+        tables,
+        lateral=tables.params.lateral._replace(weights=jnp.zeros(6), friction=jnp.full(3, 1e6)),
     )
     history = [disturbed(seed, planar=True, scale=0.05) for seed in range(3)]
     ours, state = torques(free, inactive, history)
     assert (np.asarray(state.force)[[0, 3], 1] > 10.0).all()  # feet that need not pull
-    theirs, flat = torques(compiled(PLANAR), params, history)
+    theirs, flat = torques(compiled(PLANAR), tables, history)
     # Thigh and calf everywhere; abduction where the leg swings: in stance the planar robot's is
     # held, the free one's carries its share.  Rounding times gains, and the QP's tolerance.
     np.testing.assert_allclose(ours[..., 1:], theirs[..., 1:], rtol=0, atol=1e-3)
@@ -148,19 +149,19 @@ def test_without_a_regulator_a_planar_state_gives_the_planar_controller_s_torque
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_state_keeps_its_tree_shapes_and_types(dtype):
     controller = build_controller(controller_spec(FREE))
-    params = build_params(FREE, go1.PARAMS, dtype=dtype)
+    tables = condense(*resolve(FREE, go1.PARAMS), dtype=dtype)
     observation = disturbed(0, dtype=dtype)
-    state = jax.eval_shape(controller.init, params, observation)
-    planned, _ = jax.eval_shape(controller.plan, params, state, observation)
-    acted, torque = jax.eval_shape(controller.act, params, planned, observation)
+    state = jax.eval_shape(controller.init, tables, observation)
+    planned, _ = jax.eval_shape(controller.plan, tables, state, observation)
+    acted, torque = jax.eval_shape(controller.act, tables, planned, observation)
     chex.assert_trees_all_equal_shapes_and_dtypes(state, planned, acted)
     assert torque.dtype == dtype
     assert state.swing.lift_off.shape == (4, 3)
 
 
-def test_single_precision_agrees_with_double(free, params):
-    single = build_params(FREE, go1.PARAMS, dtype=jnp.float32)
-    double, _ = torques(free, params, [disturbed(1)])
+def test_single_precision_agrees_with_double(free, tables):
+    single = condense(*resolve(FREE, go1.PARAMS), dtype=jnp.float32)
+    double, _ = torques(free, tables, [disturbed(1)])
     # Far from the origin float32 resolves 2e-7 m of a place, times 3e4 N/m of gain: 0.02 N.
     half, _ = torques(free, single, [disturbed(1, dtype=jnp.float32)])
     assert half.dtype == np.float32
@@ -168,42 +169,42 @@ def test_single_precision_agrees_with_double(free, params):
 
 
 @pytest.mark.parametrize("field", ["base_quat", "joint_vel"])
-def test_a_non_finite_observation_is_reported_and_spreads_nowhere(free, params, field):
+def test_a_non_finite_observation_is_reported_and_spreads_nowhere(free, tables, field):
     good = disturbed(0)
-    state, _ = free.plan(params, free.init(params, good), good)
+    state, _ = free.plan(tables, free.init(tables, good), good)
     values = getattr(good, field)
     broken = good._replace(**{field: jnp.full_like(values, jnp.nan)})
-    state, info = free.plan(params, state, broken)
+    state, info = free.plan(tables, state, broken)
     assert int(info.status) == qp.Status.NON_FINITE
-    state, torque = free.act(params, state, broken)
+    state, torque = free.act(tables, state, broken)
     np.testing.assert_array_equal(torque, 0.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
-    state, info = free.plan(params, state, good)
+    state, info = free.plan(tables, state, good)
     assert int(info.status) == qp.Status.SOLVED
 
 
-def test_the_heading_to_keep_is_that_of_the_first_valid_sample(free, params):
+def test_the_heading_to_keep_is_that_of_the_first_valid_sample(free, tables):
     good = seen_from(disturbed(0), 2.0, (0.0, 0.0))
-    state = free.init(params, good._replace(base_quat=jnp.full(4, jnp.nan)))
+    state = free.init(tables, good._replace(base_quat=jnp.full(4, jnp.nan)))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
-    state, info = free.plan(params, state, good)
+    state, info = free.plan(tables, state, good)
     assert int(info.status) == qp.Status.SOLVED
-    ours = free.init(params, good)
+    ours = free.init(tables, good)
     np.testing.assert_allclose(state.track, ours.track, rtol=0, atol=1e-12)
-    again, _ = free.plan(params, state, seen_from(good, 0.3, (0.0, 0.0)))
+    again, _ = free.plan(tables, state, seen_from(good, 0.3, (0.0, 0.0)))
     np.testing.assert_array_equal(again.track, state.track)
 
 
-def test_the_gradient_through_act_is_finite_on_the_free_base(params):
+def test_the_gradient_through_act_is_finite_on_the_free_base(tables):
     """Swing legs press with nothing, where a root has no derivative."""
     controller = build_controller(controller_spec(FREE))
     seen = disturbed(0)
-    state, _ = controller.plan(params, controller.init(params, seen), seen)
+    state, _ = controller.plan(tables, controller.init(tables, seen), seen)
 
-    def cost(params, seen):
-        return jnp.sum(controller.act(params, state, seen)[1] ** 2)
+    def cost(tables, seen):
+        return jnp.sum(controller.act(tables, state, seen)[1] ** 2)
 
-    slopes = jax.jit(jax.grad(cost, (0, 1), allow_int=True))(params, seen)
+    slopes = jax.jit(jax.grad(cost, (0, 1), allow_int=True))(tables, seen)
     for leaf in jax.tree.leaves(slopes):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
             assert np.isfinite(leaf).all()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kjax import RunConfig, build_controller, load_config, qp
-from kjax.params import build_params
-from kjax.resolve import controller_spec
+from kjax.params import condense
+from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
 from kjax.types import Leg, Mode, Observation
 
@@ -50,8 +50,8 @@ def controller():
 
 
 @pytest.fixture(scope="module")
-def params():
-    return build_params(config(), go1.PARAMS)
+def tables():
+    return condense(*resolve(config(), go1.PARAMS))
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +60,11 @@ def plan(controller):
 
 
 @pytest.fixture(scope="module")
-def ticks(controller, params, plan):
+def ticks(controller, tables, plan):
     """States and infos of 130 plans of a robot that is held still: bound, then trot."""
-    state, log = controller.init(params, standing()), []
+    state, log = controller.init(tables, standing()), []
     for _ in range(130):
-        state, info = plan(params, state, standing())
+        state, info = plan(tables, state, standing())
         log.append((state, info))
     return log
 
@@ -85,11 +85,11 @@ def test_each_phase_is_planned_by_its_own_scheme_and_solved(ticks):
             assert np.ptp(force[standing_legs], axis=0).max() == 0.0  # a pair shares
 
 
-def test_a_pitched_trunk_gets_the_same_world_force_in_its_own_frame(controller, params, plan):
+def test_a_pitched_trunk_gets_the_same_world_force_in_its_own_frame(controller, tables, plan):
     turn = 0.2  # nose up: a turn about +y by -0.2
     half = [np.cos(turn / 2), 0.0, -np.sin(turn / 2), 0.0]
     seen = standing(base_quat=half)
-    state, info = plan(params, controller.init(params, seen), seen)
+    state, info = plan(tables, controller.init(tables, seen), seen)
     assert int(info.mode) == Mode.FRONT
     force = np.asarray(state.force)[Leg.FR]
     c, s = np.cos(turn), np.sin(turn)
@@ -99,11 +99,11 @@ def test_a_pitched_trunk_gets_the_same_world_force_in_its_own_frame(controller, 
 
 
 def test_a_nan_in_the_observation_is_reported_and_leaves_the_reference_force(
-    controller, params, plan
+    controller, tables, plan
 ):
-    state = controller.init(params, standing())
+    state = controller.init(tables, standing())
     bad = standing(base_vel=[np.nan, 0.0, 0.0])
-    state, info = plan(params, state, bad)
+    state, info = plan(tables, state, bad)
     assert info.status == qp.Status.NON_FINITE
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
     force = np.asarray(state.force)
@@ -111,17 +111,17 @@ def test_a_nan_in_the_observation_is_reported_and_leaves_the_reference_force(
     share = 0.148 / (0.075 + 0.148)
     load = 12.743 * 9.81 * 0.35 * share / (2 * 0.1)
     assert force[[Leg.FR, Leg.FL], 1] == pytest.approx(load, rel=0.01)
-    _, info = plan(params, state, standing())
+    _, info = plan(tables, state, standing())
     assert info.status == qp.Status.SOLVED
 
 
-def test_a_batch_of_robots_in_other_phases_equals_single_ones(plan, params, ticks):
+def test_a_batch_of_robots_in_other_phases_equals_single_ones(plan, tables, ticks):
     chosen = [ticks[i][0] for i in (5, 25, 42, 120)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *chosen)
     seen = standing()
-    states, infos = jax.vmap(plan, in_axes=(None, 0, None))(params, batch, seen)
+    states, infos = jax.vmap(plan, in_axes=(None, 0, None))(tables, batch, seen)
     for i, one in enumerate(chosen):
-        state, info = plan(params, one, seen)
+        state, info = plan(tables, one, seen)
         assert infos.mode[i] == info.mode
         np.testing.assert_allclose(states.force[i], state.force, atol=1e-4)
 
@@ -139,12 +139,14 @@ def test_integral_action_adds_up_the_velocity_error_and_starts_afresh_with_a_gai
 
 
 def test_the_correction_stays_within_its_limit(controller, plan):
-    params = build_params(
-        config(**{"lmpc.integral_limits": [0.01, 0.02], "lmpc.integral_gains": [10.0, 1.0]}),
-        go1.PARAMS,
+    tables = condense(
+        *resolve(
+            config(**{"lmpc.integral_limits": [0.01, 0.02], "lmpc.integral_gains": [10.0, 1.0]}),
+            go1.PARAMS,
+        )
     )
-    state = controller.init(params, standing())
+    state = controller.init(tables, standing())
     for _ in range(40):
-        state, _ = plan(params, state, standing())
+        state, _ = plan(tables, state, standing())
     np.testing.assert_allclose(state.correction[0], 0.01)
     assert abs(state.correction[1]) <= 0.02

@@ -13,8 +13,8 @@ from hypothesis.extra.numpy import arrays
 from kjax import Observation, build_controller, check_observation, load_config, qp
 from kjax.config import RunConfig
 from kjax.observation import SHAPES, cast, is_valid
-from kjax.params import build_params
-from kjax.resolve import controller_spec
+from kjax.params import condense, with_params
+from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
 
 CONFIG = load_config(RunConfig, None, {"lmpc.horizon": 2, "koopman.order": 1})
@@ -109,8 +109,8 @@ def controller():
 
 
 @pytest.fixture(scope="module")
-def params():
-    return build_params(CONFIG, go1.PARAMS)
+def tables():
+    return condense(*resolve(CONFIG, go1.PARAMS))
 
 
 @pytest.fixture(scope="module")
@@ -118,11 +118,11 @@ def calls(controller):
     return jax.jit(controller.init), jax.jit(controller.plan), jax.jit(controller.act)
 
 
-def test_init_looks_at_what_it_can_and_leaves_traced_samples_alone(controller, params, calls):
+def test_init_looks_at_what_it_can_and_leaves_traced_samples_alone(controller, tables, calls):
     wrong = standing(joint_pos=-JOINTS)
     with pytest.raises(ValueError, match="do the joints have the other sign"):
-        controller.init(params, wrong)
-    assert np.isfinite(calls[0](params, wrong).ground)
+        controller.init(tables, wrong)
+    assert np.isfinite(calls[0](tables, wrong).ground)
 
 
 def finite(tree):
@@ -138,17 +138,17 @@ USELESS = {
 }
 
 
-def test_a_position_that_is_no_number_is_not_missed(params, calls):
+def test_a_position_that_is_no_number_is_not_missed(tables, calls):
     """The controller does not read it: an odometry that drops out must not stop the robot."""
     init, plan, act = calls
     good = standing()
-    state = init(params, good)
+    state = init(tables, good)
     lost = good._replace(base_pos=np.full(3, np.nan))
     for seen in (lost, good):
-        _, info = plan(params, state, seen)
+        _, info = plan(tables, state, seen)
         assert int(info.status) == qp.Status.SOLVED
         assert float(info.blind_time) == 0.0
-    np.testing.assert_array_equal(act(params, state, lost)[1], act(params, state, good)[1])
+    np.testing.assert_array_equal(act(tables, state, lost)[1], act(tables, state, good)[1])
 
 
 def test_a_contact_flag_that_is_no_number_is_off():
@@ -156,62 +156,62 @@ def test_a_contact_flag_that_is_no_number_is_off():
     np.testing.assert_array_equal(seen.contact, [True, False, False, True])
 
 
-def test_lists_are_as_good_as_arrays(params):
+def test_lists_are_as_good_as_arrays(tables):
     controller = build_controller(controller_spec(CONFIG))
     lists = Observation(*(np.asarray(field).tolist() for field in standing()))
-    first, second = (controller.init(params, seen) for seen in (lists, standing()))
+    first, second = (controller.init(tables, seen) for seen in (lists, standing()))
     jax.tree.map(np.testing.assert_array_equal, first, second)
     assert not bool(is_valid(jax.tree.map(jnp.asarray, standing(base_vel=np.full(3, np.nan)))))
 
 
-def test_init_takes_a_constant_sample_inside_a_trace(params):
+def test_init_takes_a_constant_sample_inside_a_trace(tables):
     """Domain randomisation: one sample for many robots."""
     controller, good = build_controller(controller_spec(CONFIG)), standing()
-    eager = controller.init(params, good)
-    inside = jax.jit(lambda: controller.init(params, good))()
-    given = jax.jit(lambda params: controller.init(params, good))(params)
+    eager = controller.init(tables, good)
+    inside = jax.jit(lambda: controller.init(tables, good))()
+    given = jax.jit(lambda tables: controller.init(tables, good))(tables)
     for state in (inside, given):
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-12), state, eager
         )
-    masses = jnp.stack([params.robot.mass, 1.1 * params.robot.mass])
+    masses = jnp.stack([tables.params.robot.mass, 1.1 * tables.params.robot.mass])
     many = jax.vmap(lambda m: controller.init(
-        params._replace(robot=params.robot._replace(mass=m)), good))(masses)  # fmt: skip
+        with_params(tables, robot=tables.params.robot._replace(mass=m)), good))(masses)  # fmt: skip
     assert many.ground.shape[0] == 2
 
 
 @pytest.mark.parametrize("name", USELESS)
-def test_one_useless_sample_changes_nothing_that_is_sensed(params, calls, name):
+def test_one_useless_sample_changes_nothing_that_is_sensed(tables, calls, name):
     init, plan, act = calls
     good = standing()
-    state, _ = plan(params, init(params, good), good)
-    state, torque = act(params, state, good)
+    state, _ = plan(tables, init(tables, good), good)
+    state, torque = act(tables, state, good)
     for values in USELESS[name]:
         bad = good._replace(**{name: values})
         assert not bool(is_valid(jax.tree.map(jnp.asarray, bad)))
-        planned, info = plan(params, state, bad)
+        planned, info = plan(tables, state, bad)
         assert int(info.status) == qp.Status.NON_FINITE
-        acted, held = act(params, planned, bad)
+        acted, held = act(tables, planned, bad)
         assert finite((planned, acted, held))
         np.testing.assert_array_equal(held, torque)  # the last command holds
         # What comes from the clock goes on, what is sensed stays: the robot is at rest.
         assert float(acted.time) > float(state.time)
         for field in ("lag", "ground", "feet", "base_vel", "correction"):
             np.testing.assert_allclose(getattr(acted, field), getattr(state, field), atol=1e-12)
-        _, info = plan(params, acted, good)
+        _, info = plan(tables, acted, good)
         assert int(info.status) == qp.Status.SOLVED
 
 
-def test_without_samples_the_last_torque_holds_for_a_while_and_turns_into_damping(params, calls):
+def test_without_samples_the_last_torque_holds_for_a_while_and_turns_into_damping(tables, calls):
     init, plan, act = calls
     good = standing()
-    state, _ = plan(params, init(params, good), good)
-    state, torque = act(params, state, good)
+    state, _ = plan(tables, init(tables, good), good)
+    state, torque = act(tables, state, good)
     rates = 0.1 * np.arange(12.0).reshape(4, 3)
     blind = good._replace(base_quat=np.zeros(4), joint_vel=rates)
     torques = []
     for _ in range(30):
-        state, one = act(params, state, blind)
+        state, one = act(tables, state, blind)
         torques.append(np.asarray(one))
     hold = round(CONFIG.leg.hold_time / CONFIG.leg.act_dt)
     np.testing.assert_array_equal(torques[:hold], np.tile(torque, (hold, 1, 1)))
@@ -220,7 +220,7 @@ def test_without_samples_the_last_torque_holds_for_a_while_and_turns_into_dampin
     swinging = ~np.asarray(state.stance)
     np.testing.assert_allclose(np.asarray(state.swing.elapsed)[swinging], 0.031, atol=1e-12)
     # Joint rates that cannot be are no base for damping.
-    _, nothing = act(params, state, blind._replace(joint_vel=np.full((4, 3), np.nan)))
+    _, nothing = act(tables, state, blind._replace(joint_vel=np.full((4, 3), np.nan)))
     np.testing.assert_array_equal(nothing, 0.0)
 
 
@@ -240,34 +240,37 @@ WILD = st.floats(allow_nan=True, allow_infinity=True, width=64)
         }
     )
 )
-def test_state_and_command_stay_finite_whatever_comes_in(params, calls, observation):
+def test_state_and_command_stay_finite_whatever_comes_in(tables, calls, observation):
     init, plan, act = calls
     seen = Observation(**observation)
-    state = init(params, seen)
+    state = init(tables, seen)
     assert finite(state)
-    state, _ = plan(params, state, standing())
-    state, _ = plan(params, state, seen)
-    state, torque = act(params, state, seen)
+    state, _ = plan(tables, state, standing())
+    state, _ = plan(tables, state, seen)
+    state, torque = act(tables, state, seen)
     assert finite((state, torque))
-    state, _ = plan(params, state, standing())
+    state, _ = plan(tables, state, standing())
     assert finite(state)
 
 
-def test_the_state_may_be_donated(controller, params):
-    state = controller.init(params, standing())
+def test_the_state_may_be_donated(controller, tables):
+    state = controller.init(tables, standing())
     plan = jax.jit(controller.plan, donate_argnums=1)
     act = jax.jit(controller.act, donate_argnums=1)
     observation = jax.tree.map(jnp.asarray, standing())
     for _ in range(2):
-        state, _ = plan(params, state, observation)
-        state, _ = act(params, state, observation)
-    assert finite((state, params))
+        state, _ = plan(tables, state, observation)
+        state, _ = act(tables, state, observation)
+    assert finite((state, tables))
 
 
-def test_a_command_that_is_no_number_leaves_the_last_one(controller, params, calls):
+def test_a_command_that_is_no_number_leaves_the_last_one(controller, tables, calls):
     init, plan, _ = calls
-    broken = params._replace(
-        command=params.command._replace(velocities=jnp.full(5, jnp.nan, params.height.dtype))
+    broken = with_params(
+        tables,
+        command=tables.params.command._replace(
+            velocities=jnp.full(5, jnp.nan, tables.params.height.dtype)
+        ),
     )
     state, info = plan(broken, init(broken, standing()), standing())
     assert finite(state)

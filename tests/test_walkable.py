@@ -7,7 +7,7 @@ import pytest
 
 from kjax import load_config
 from kjax.config import ConfigError, RunConfig
-from kjax.params import build_params
+from kjax.resolve import resolve
 from kjax.rigid_body import mean_force
 from kjax.robots import go1
 from kjax.types import GRAVITY, MODE_ALPHA
@@ -39,7 +39,7 @@ def test_bounds_that_cannot_carry_the_weight_name_their_key_and_what_is_needed()
     with pytest.raises(ValueError, match=text):
         check_walkable(RunConfig(), HEAVY)
     with pytest.raises(ValueError, match=text):
-        build_params(RunConfig(), HEAVY)
+        resolve(RunConfig(), HEAVY)
     check_walkable(config(lmpc__force_z_max=500.0), HEAVY)
 
 

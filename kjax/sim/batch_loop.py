@@ -23,7 +23,7 @@ import mujoco.batch
 import numpy as np
 
 from kjax.config import RunConfig
-from kjax.params import ControllerParams
+from kjax.params import Tables
 from kjax.sim.cases import (
     BatchSpec,
     Case,
@@ -31,7 +31,7 @@ from kjax.sim.cases import (
     check_engine,
     push_at,
     stack_cases,
-    stack_params,
+    stack_tables,
 )
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import find_addresses
@@ -51,8 +51,8 @@ class Calls(NamedTuple):
     """Jitted functions of a group, batched over its robots.
 
     Attributes:
-      init: (params, case, sensed) -> state.
-      first: (params, case, state, step, sensed) -> (state, torque, log); plan and act.
+      init: (tables, case, sensed) -> state.
+      first: (tables, case, state, step, sensed) -> (state, torque, log); plan and act.
       then: the same without plan -> (state, torque).
     """
 
@@ -114,7 +114,7 @@ class BatchEngine:
         threads = min(self.threads, len(configs))
         size = -(-len(configs) // threads)
         filled = [*configs, *[configs[-1]] * (threads * size - len(configs))]
-        params, axes = stack_params(filled, self.dtype)
+        tables, axes = stack_tables(filled, self.dtype)
         case = stack_cases(filled)
         calls = self._compiled(axes)
         stop, groups = Event(), []
@@ -128,7 +128,7 @@ class BatchEngine:
                     self.torques,
                     self.dtype,
                     stop,
-                    params=_rows(params, axes, own),
+                    tables=_rows(tables, axes, own),
                     case=jax.tree.map(lambda a, s=own: a[s], case),
                 )
             )
@@ -164,9 +164,9 @@ class BatchEngine:
         if key not in self._calls:
             walk = self._walk
 
-            def both(params: Any, case: Any, state: Any, step: Any, sensed: Any) -> Any:
-                state, log = walk.plan(params, case, state, step, sensed)
-                state, torque = walk.act(params, case, state, step, sensed)
+            def both(tables: Any, case: Any, state: Any, step: Any, sensed: Any) -> Any:
+                state, log = walk.plan(tables, case, state, step, sensed)
+                state, torque = walk.act(tables, case, state, step, sensed)
                 return state, torque, log
 
             self._calls[key] = Calls(
@@ -190,12 +190,12 @@ class _Group:
         dtype: np.dtype,
         stop: Event,
         *,
-        params: ControllerParams,
+        tables: Tables,
         case: Case,
     ):
         config, count = configs[0], len(configs)
         self._calls, self._stop, self._dtype = calls, stop, dtype
-        self._params, self._case = params, case
+        self._tables, self._case = tables, case
         self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
         per_act = round(config.leg.act_dt / config.sim.sim_dt)
         # Physics steps that share a torque.
@@ -235,16 +235,16 @@ class _Group:
     def warm_up(self) -> None:
         """Compile by calling, results dropped."""
         sensed, step = self.sensed(), np.int32(0)
-        state = self._calls.init(self._params, self._case, sensed)
-        state, *rest = self._calls.first(self._params, self._case, state, step, sensed)
+        state = self._calls.init(self._tables, self._case, sensed)
+        state, *rest = self._calls.first(self._tables, self._case, state, step, sensed)
         if self._unit < self._per_tick:
-            state, *rest = self._calls.then(self._params, self._case, state, step, sensed)
+            state, *rest = self._calls.then(self._tables, self._case, state, step, sensed)
         jax.block_until_ready((state, rest))
 
     def walk(self) -> None:
         """All ticks, until told to stop."""
-        params, case = self._params, self._case
-        state = self._calls.init(params, case, self.sensed())
+        tables, case = self._tables, self._case
+        state = self._calls.init(tables, case, self.sensed())
         alive = np.ones(len(self.fell), bool)
         ids: np.ndarray | None = None  # all
         series: tuple[np.ndarray, ...] = ()
@@ -252,7 +252,7 @@ class _Group:
             if self._stop.is_set() or not alive.any():
                 break
             step, sensed = tick * self._per_tick, self.sensed()
-            state, torque, log = self._calls.first(params, case, state, np.int32(step), sensed)
+            state, torque, log = self._calls.first(tables, case, state, np.int32(step), sensed)
             host = TickLog(*map(np.asarray, log))
             torque = np.asarray(torque)
             if not series:
@@ -272,7 +272,7 @@ class _Group:
             for i in range(0, self._per_tick, self._unit):
                 if i > 0:
                     state, torque = self._calls.then(
-                        params, case, state, np.int32(step + i), self.sensed()
+                        tables, case, state, np.int32(step + i), self.sensed()
                     )
                     torque = np.asarray(torque)
                 self._apply(torque, step + i)
@@ -369,12 +369,12 @@ def require_one_batch(spec: BatchSpec, configs: Sequence[RunConfig], torques: st
         check_engine(config, torques=torques)
 
 
-def _rows(params: ControllerParams, axes: Any, rows: slice) -> ControllerParams:
+def _rows(tables: Tables, axes: Any, rows: slice) -> Tables:
     """Parameters of some robots of a batch."""
     return jax.tree.map(
         lambda axis, leaf: leaf if axis is None else jnp.asarray(leaf[rows]),
         axes,
-        params,
+        tables,
         is_leaf=lambda a: a is None,
     )
 

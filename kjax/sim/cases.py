@@ -22,8 +22,8 @@ from kjax.config import (
     SimConfig,
     TerrainConfig,
 )
-from kjax.params import ControllerParams, build_params
-from kjax.resolve import controller_spec
+from kjax.params import Tables, condense, with_params
+from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
 from kjax.sim.episode import origin
 from kjax.sim.excitation import force_deviation
@@ -151,8 +151,8 @@ def push_at(case: Case, step: Any, count: int = 1, xp: Any = np) -> Any:
     return (part[..., None] * case.push_force).sum(axis=-2)
 
 
-def stack_params(configs: Sequence[RunConfig], dtype: Any) -> tuple[ControllerParams, Any]:
-    """Controller parameters of a batch, and which leaves have its leading axis.
+def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]:
+    """What the controller's functions take, of a batch, and which leaves have its leading axis.
 
     Configs that differ in nothing that the parameters come from share one fit; leaves that are the
     same for all robots stay single. Command and requests of gaits always have the axis.
@@ -162,20 +162,21 @@ def stack_params(configs: Sequence[RunConfig], dtype: Any) -> tuple[ControllerPa
       dtype: floating type.
 
     Returns:
-      The parameters, and for each leaf 0 or ``None``: ``vmap``'s ``in_axes``.
+      The tables, and for each leaf 0 or ``None``: ``vmap``'s ``in_axes``.
     """
-    built: dict[RunConfig, ControllerParams] = {}
+    built: dict[RunConfig, Tables] = {}
     kinds = [_params_part(config) for config in configs]
     for kind, config in zip(kinds, configs, strict=True):
         if kind not in built:
-            built[kind] = jax.device_get(build_params(config, go1.PARAMS, dtype=dtype))
+            spec, params = resolve(config, go1.PARAMS)
+            built[kind] = jax.device_get(condense(spec, params, dtype=dtype))
     names = list(built)
     which = np.array([names.index(kind) for kind in kinds])
     pieces = max(len(config.command.times) for config in configs)
     requests = max(len(config.gait.times) for config in configs)
     own: list[tuple[np.ndarray, ...]] = []
     for kind, config in zip(kinds, configs, strict=True):
-        gaits, command = built[kind].gaits, config.command
+        gaits, command = built[kind].params.gaits, config.command
         own.append(
             (
                 _filled(command.times, pieces, np.inf).astype(dtype),
@@ -186,14 +187,16 @@ def stack_params(configs: Sequence[RunConfig], dtype: Any) -> tuple[ControllerPa
         )
     times, velocities, gait_times, gait_names = map(np.stack, zip(*own, strict=True))
 
-    def hollow(params: ControllerParams, *fields: Any) -> Any:
-        return params._replace(**dict(zip(("command", "gait_times", "gaits"), fields, strict=True)))
+    def hollow(tables: Tables, *fields: Any) -> Any:
+        return with_params(
+            tables, **dict(zip(("command", "gait_times", "gaits"), fields, strict=True))
+        )
 
     def stack(*leaves: Any) -> Any:
         same = all(np.array_equal(leaf, leaves[0]) for leaf in leaves[1:])
         return leaves[0] if same else np.stack(leaves)[which]
 
-    shared = [hollow(params, 0, 0, 0) for params in built.values()]
+    shared = [hollow(tables, 0, 0, 0) for tables in built.values()]
     axes = jax.tree.map(
         lambda *leaves: None if np.ndim(stack(*leaves)) == np.ndim(leaves[0]) else 0, *shared
     )

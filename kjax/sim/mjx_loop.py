@@ -17,7 +17,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from kjax.config import RunConfig
-from kjax.params import ControllerParams
+from kjax.params import Tables
 from kjax.sim.batch_loop import (
     OnProgress,
     Torques,
@@ -31,7 +31,7 @@ from kjax.sim.cases import (
     check_engine,
     push_at,
     stack_cases,
-    stack_params,
+    stack_tables,
 )
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
@@ -126,7 +126,7 @@ class MjxEngine:
           ValueError: for a config with another ``batch_spec``, or other durations.
         """
         require_one_batch(self.spec, configs, self.torques)
-        params, axes = stack_params(configs, self.dtype)
+        tables, axes = stack_tables(configs, self.dtype)
         models = dressed(self.model, configs)
         case, (own, own_axes) = stack_cases(configs), self._differences(models)
         sensed, warm = self._start(configs, models)
@@ -136,14 +136,14 @@ class MjxEngine:
         place = _sharding(len(configs))
         if place:
             case, sensed, warm, own = jax.device_put((case, sensed, warm, own), place)
-            params = _spread(params, axes, place)
+            tables = _spread(tables, axes, place)
         begin, pieces, interrupted = time.perf_counter(), [], False
-        state = begin_call(params, case, sensed, warm)
+        state = begin_call(tables, case, sensed, warm)
         try:
             for done in range(0, ticks, _PIECE):
                 count = min(_PIECE, ticks - done)
                 # The last piece may be shorter than it is computed: one program for all.
-                state, piece = walk_call(params, own, case, state)
+                state, piece = walk_call(tables, own, case, state)
                 pieces.append(jax.device_get(jax.tree.map(lambda a, n=count: a[:n], piece)))
                 if on_progress is not None:
                     on_progress((done + count) * len(configs), ticks * len(configs))
@@ -211,12 +211,12 @@ class MjxEngine:
         key = (tuple(leaves), tree, tuple(own_axes), delays)
         if key not in self._calls:
 
-            def begin(params: Any, case: Case, sensed: Sensed, warm: Array) -> MjxState:
-                return self._begin(params, case, sensed, warm, delays)
+            def begin(tables: Any, case: Case, sensed: Sensed, warm: Array) -> MjxState:
+                return self._begin(tables, case, sensed, warm, delays)
 
-            def piece(params: Any, own: Any, case: Case, state: MjxState) -> Any:
+            def piece(tables: Any, own: Any, case: Case, state: MjxState) -> Any:
                 self.traces += 1
-                return self._walk_piece(params, own, case, state)
+                return self._walk_piece(tables, own, case, state)
 
             self._calls[key] = (
                 jax.jit(jax.vmap(begin, (axes, 0, 0, 0))),
@@ -225,7 +225,7 @@ class MjxEngine:
         return self._calls[key]
 
     def _begin(
-        self, params: ControllerParams, case: Case, sensed: Sensed, warm: Array, delays: int
+        self, tables: Tables, case: Case, sensed: Sensed, warm: Array, delays: int
     ) -> MjxState:
         data = self._cast(mjx.make_data(self._mjx, **_impl_argument(self._impl)))
         # Through .at[], since a replaced host array has another layout and compiles twice.
@@ -237,13 +237,13 @@ class MjxEngine:
         )
         return MjxState(
             data=data,
-            walk=self._walk.init(params, case, _sensed(data)),
+            walk=self._walk.init(tables, case, _sensed(data)),
             under_way=jnp.zeros((delays, self.model.nu), self.dtype),
             step=jnp.zeros((), jnp.int32),
         )
 
     def _walk_piece(
-        self, params: ControllerParams, own: dict[str, Array], case: Case, state: MjxState
+        self, tables: Tables, own: dict[str, Array], case: Case, state: MjxState
     ) -> tuple[MjxState, MjxTick]:
         model, walk, unit = self._mjx.replace(**own), self._walk, self._unit
         trunk = pushed_body(self.model)
@@ -266,7 +266,7 @@ class MjxEngine:
 
         def act(carry: MjxState, _: None) -> tuple[MjxState, Array]:
             data, robot, under_way, at = carry
-            robot, torque = walk.act(params, case, robot, at, _sensed(data))
+            robot, torque = walk.act(tables, case, robot, at, _sensed(data))
             under_way, applied = delayed(under_way, torque, at // unit)
 
             def onward(data: Any, i: Array) -> tuple[Any, None]:
@@ -280,7 +280,7 @@ class MjxEngine:
 
         def tick(carry: MjxState, _: None) -> tuple[MjxState, MjxTick]:
             data, robot, under_way, at = carry
-            robot, log = walk.plan(params, case, robot, at, _sensed(data))
+            robot, log = walk.plan(tables, case, robot, at, _sensed(data))
             carry = MjxState(data, robot, under_way, at)
             after, torques = jax.lax.scan(act, carry, None, length=self._per_tick // unit)
             return after, MjxTick(data.qpos, data.qvel, torques[0], robot.alive, log)
@@ -318,12 +318,12 @@ def _sharding(robots: int) -> NamedSharding | None:
     return NamedSharding(mesh, PartitionSpec("robots"))
 
 
-def _spread(params: ControllerParams, axes: Any, place: NamedSharding) -> ControllerParams:
+def _spread(tables: Tables, axes: Any, place: NamedSharding) -> Tables:
     """Parameters on all devices, those of single robots on the robot's own."""
     everywhere = NamedSharding(place.mesh, PartitionSpec())
     return jax.tree.map(
         lambda axis, leaf: jax.device_put(leaf, everywhere if axis is None else place),
         axes,
-        params,
+        tables,
         is_leaf=lambda a: a is None,
     )

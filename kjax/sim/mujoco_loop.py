@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from kjax.config import RunConfig
 from kjax.controller import Controller, build_controller
-from kjax.params import ControllerParams
+from kjax.params import Tables, condense, with_params
 from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.sim import free_base
@@ -101,7 +101,7 @@ class Simulation(NamedTuple):
       addresses: of joints, actuators, sensors.
       observe: (qpos, qvel, sensordata) -> observation.
       controller: pure functions.
-      params: controller numbers.
+      tables: what the controller's functions take.
       init: jitted (sensed, requests) -> state; without requests, those of the config.
       plan: jitted (state, sensed) -> (state, log).
       act: jitted (state, sensed) -> (state, torque (12,) in leg order).
@@ -113,7 +113,7 @@ class Simulation(NamedTuple):
     addresses: Addresses
     observe: Observe
     controller: Controller
-    params: ControllerParams
+    tables: Tables
     init: Callable[..., Array]
     plan: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
     act: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
@@ -125,7 +125,7 @@ def build_simulation(config: RunConfig) -> Simulation:
     model = build_model(config.sim, config.terrain)
     observe = build_observe(model, config.sim.contact_threshold)
     spec, params = resolve(config, go1.PARAMS)
-    controller = build_controller(spec)
+    controller, tables = build_controller(spec), condense(spec, params)
     parts = (model.nq, model.nv, model.nsensordata, noise_dim(config.sim.base))
     cuts, size = np.cumsum(parts[:-1]), sum(parts)
     excited = force_deviation(config.noise) > 0
@@ -148,8 +148,8 @@ def build_simulation(config: RunConfig) -> Simulation:
             ],
         )
 
-    def asked(requests: Requests) -> ControllerParams:
-        return params._replace(gait_times=requests.gait_times, command=requests.command)
+    def asked(requests: Requests) -> Tables:
+        return with_params(tables, gait_times=requests.gait_times, command=requests.command)
 
     def begin(sensed: Array, wanted: Requests) -> LoopState:
         wanted = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), wanted)
@@ -183,7 +183,7 @@ def build_simulation(config: RunConfig) -> Simulation:
         state, torque = controller.act(asked(loop.requests), loop.controller, sense(sensed))
         return pack(loop._replace(controller=state)), torque.reshape(-1)
 
-    dtype = params.position_slack.dtype
+    dtype = tables.params.position_slack.dtype
     example = jax.ShapeDtypeStruct((size + 4 * excited,), dtype)
     default = requests(config)
     state_like = jax.eval_shape(begin, example, default)
@@ -195,7 +195,7 @@ def build_simulation(config: RunConfig) -> Simulation:
         addresses=find_addresses(model),
         observe=observe,
         controller=controller,
-        params=params,
+        tables=tables,
         init=lambda sensed, wanted=default: jitted_init(sensed, wanted),
         plan=jax.jit(plan),
         act=jax.jit(act),

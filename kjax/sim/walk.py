@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from kjax.controller import build_controller
 from kjax.legs.base import build_base
-from kjax.params import ControllerParams
+from kjax.params import Tables
 from kjax.sim.cases import BatchSpec, Case
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
 from kjax.sim.excitation import force_row, perturb
@@ -73,14 +73,14 @@ class Walk(NamedTuple):
     """Functions of one robot.
 
     Attributes:
-      init: (params, case, sensed) -> state.
-      plan: (params, case, state, step, sensed) -> (state, log); at the control rate.
-      act: (params, case, state, step, sensed) -> (state, torque (12,) in actuator order).
+      init: (tables, case, sensed) -> state.
+      plan: (tables, case, state, step, sensed) -> (state, log); at the control rate.
+      act: (tables, case, state, step, sensed) -> (state, torque (12,) in actuator order).
     """
 
-    init: Callable[[ControllerParams, Case, Sensed], WalkState]
-    plan: Callable[[ControllerParams, Case, WalkState, Array, Sensed], tuple[WalkState, TickLog]]
-    act: Callable[[ControllerParams, Case, WalkState, Array, Sensed], tuple[WalkState, Array]]
+    init: Callable[[Tables, Case, Sensed], WalkState]
+    plan: Callable[[Tables, Case, WalkState, Array, Sensed], tuple[WalkState, TickLog]]
+    act: Callable[[Tables, Case, WalkState, Array, Sensed], tuple[WalkState, Array]]
 
 
 def build_walk(
@@ -115,24 +115,24 @@ def build_walk(
         # Else XLA draws the numbers again for each of their uses.
         return jax.lax.optimization_barrier(seen)
 
-    def init(params: ControllerParams, case: Case, sensed: Sensed) -> WalkState:
+    def init(tables: Tables, case: Case, sensed: Sensed) -> WalkState:
         first = sense(case, jnp.zeros((), jnp.int32), sensed)
         return WalkState(
-            controller=controller.init(params, first),
+            controller=controller.init(tables, first),
             track=base.track(see(sensed)),
             alive=jnp.ones((), bool),
         )
 
     def plan(
-        params: ControllerParams, case: Case, state: WalkState, step: Array, sensed: Sensed
+        tables: Tables, case: Case, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, TickLog]:
-        moved, info = controller.plan(params, state.controller, sense(case, step, sensed))
+        moved, info = controller.plan(tables, state.controller, sense(case, step, sensed))
         if scene.force_noise:
             added = case.force_noise * force_row(case.seed, step)
             moved = moved._replace(force=perturb(moved.force, moved.stance, added))
         true = see(sensed)
         true = true._replace(base_pos=true.base_pos - case.origin.astype(true.base_pos.dtype))
-        body = base.view(params.robot, state.track, true).planar
+        body = base.view(tables.params.robot, state.track, true).planar
         log = TickLog(
             x=body.x,
             feet=body.feet,
@@ -149,9 +149,9 @@ def build_walk(
         return WalkState(moved, state.track, state.alive & standing(body.x, true)), log
 
     def act(
-        params: ControllerParams, case: Case, state: WalkState, step: Array, sensed: Sensed
+        tables: Tables, case: Case, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, Array]:
-        moved, torque = controller.act(params, state.controller, sense(case, step, sensed))
+        moved, torque = controller.act(tables, state.controller, sense(case, step, sensed))
         torque = jnp.where(state.alive, torque, 0.0)
         return state._replace(controller=moved), torque.reshape(-1)[order]
 

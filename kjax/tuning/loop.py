@@ -23,7 +23,7 @@ from kjax.config import NoiseConfig, RunConfig
 from kjax.controller import build_controller
 from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState
-from kjax.params import ControllerParams
+from kjax.params import ControllerParams, condense
 from kjax.reference import next_clock
 from kjax.resolve import controller_spec
 from kjax.rigid_body import body_numbers
@@ -129,6 +129,7 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
 
     def run(params: ControllerParams, scenario: Scenario) -> Trace:
         params = params._replace(command=scenario.command)
+        tables = condense(spec, params)
         robot, plant = params.robot, scenario.plant
         key = jax.random.wrap_key_data(scenario.key)
 
@@ -141,7 +142,7 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             measured = x.at[2:].add(error[2:])
             seen = body_plant.local_view(robot, plant.com, measured, feet)
             always = jnp.ones((), bool)
-            state, info = controller.plan_from(params, state, seen, state.stance, always)
+            state, info = controller.plan_from(tables, state, seen, state.stance, always)
             true = body_plant.view(robot, plant.com, x, feet).planar
             feet, rates, state = _swing(params, state, true, feet, dt)
             spin = body_plant.leg_momentum(robot, plant, true, feet, rates)
@@ -174,7 +175,7 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
         numbers = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
         feet = _standing(params, plant, scenario.x)
         state = controller.init_from(
-            params, body_plant.local_view(robot, plant.com, scenario.x, feet)
+            tables, body_plant.local_view(robot, plant.com, scenario.x, feet)
         )
         none = jnp.zeros_like(feet)
         first = _Carry(scenario.x, feet, state, none, none[0, 0], jnp.ones((), bool))

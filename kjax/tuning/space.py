@@ -18,7 +18,8 @@ from jaxtyping import Array
 
 from kjax.config import RunConfig, load_config, to_dict
 from kjax.koopman.families import BodyModel
-from kjax.params import ControllerParams, Fits, cast, fit_models, gather
+from kjax.params import ControllerParams, Fits, cast
+from kjax.resolve import fit_models, gather
 from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import RobotParams

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from kjax import gait
 from kjax.config import BoundConfig, MultiPhaseConfig, RunConfig, SimConfig
 from kjax.mpc import multiphase
-from kjax.params import multiphase_params
+from kjax.resolve import multiphase_params
 from kjax.robots import go1
 from kjax.types import GRAVITY, Leg, Mode
 from kjax.walkable import build_gaits, cycle_nodes

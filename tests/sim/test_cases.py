@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from kjax.config import ConfigError, RunConfig, fields, load_config
-from kjax.params import build_params
+from kjax.params import condense
+from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.sim import cases
 from kjax.sim.observe import find_addresses
@@ -77,13 +78,13 @@ def program(config):
     model = build_model(config.sim, visual=False)
     spec = cases.batch_spec(config)
     walk = build_walk(spec, model, find_addresses(model).actuator, held=False)
-    params = build_params(config, go1.PARAMS)
+    tables = condense(*resolve(config, go1.PARAMS))
     case = jax.tree.map(lambda leaf: leaf[0], cases.stack_cases([config]))
     sensed = Sensed(np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nsensordata))
-    state = jax.eval_shape(walk.init, params, case, sensed)
+    state = jax.eval_shape(walk.init, tables, case, sensed)
     step = np.int32(0)
-    plan = jax.make_jaxpr(walk.plan)(params, case, state, step, sensed)
-    act = jax.make_jaxpr(walk.act)(params, case, state, step, sensed)
+    plan = jax.make_jaxpr(walk.plan)(tables, case, state, step, sensed)
+    act = jax.make_jaxpr(walk.act)(tables, case, state, step, sensed)
     return str(plan), str(act)
 
 
@@ -143,25 +144,29 @@ def test_parameters_of_a_batch_are_those_of_its_robots():
             {"gait.names": ["trot", "bound"], "gait.times": [0.0, 2.0]},
         )
     ]
-    params, axes = cases.stack_params(configs, np.float64)
-    assert axes.height == 0
-    assert axes.swing.kp is None  # alike for all, so held once
+    tables, axes = cases.stack_tables(configs, np.float64)
+    assert axes.params.height == 0
+    assert axes.params.swing.kp is None  # alike for all, so held once
     for i, config in enumerate(configs):
-        own = build_params(config, go1.PARAMS)
-        for name in ("height", "swing", "tables"):
+        own = condense(*resolve(config, go1.PARAMS))
+        for of in (
+            lambda one: one.params.height,
+            lambda one: one.params.swing,
+            lambda one: one.lmpc,
+        ):
             jax.tree.map(
                 lambda axis, leaf, want, i=i: np.testing.assert_array_equal(
                     leaf if axis is None else leaf[i], want
                 ),
-                getattr(axes, name),
-                getattr(params, name),
-                getattr(own, name),
+                of(axes),
+                of(tables),
+                of(own),
                 is_leaf=lambda a: a is None,
             )
-        count = len(config.command.times)
+        count, params = len(config.command.times), tables.params
         np.testing.assert_array_equal(params.command.times[i, :count], config.command.times)
         assert np.isinf(params.command.times[i, count:]).all()
-        assert params.gaits[i, 0] == own.gaits[0]
+        assert params.gaits[i, 0] == own.params.gaits[0]
         assert params.gait_times.shape == (3, 2)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kjax import RunConfig, load_config
-from kjax.params import build_params
+from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.tuning.space import KINDS, build_space, tuned_config
 
@@ -17,7 +17,7 @@ SOME = ("lmpc.state_weights", "lmpc.force_z_min", "leg.velocity_gain", "bound.fe
 
 def test_the_variables_of_a_config_give_its_own_parameters():
     space = build_space(BOUND, SOME)
-    ours, theirs = space.params(space.start), build_params(BOUND, go1.PARAMS)
+    ours, theirs = space.params(space.start), resolve(BOUND, go1.PARAMS)[1]
     # exp(log(p)) is p to rounding, and the condensed Hessians have condition numbers up to 1e6.
     for own, wanted in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         own, wanted = (np.asarray(leaf, float) for leaf in (own, wanted))

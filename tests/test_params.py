@@ -1,0 +1,79 @@
+"""From numbers to tables: one way inside and outside ``jit``, with derivatives by weights."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kjax import RunConfig, build_controller, condense, load_config, resolve
+from kjax.observation import standing
+from kjax.params import with_params
+from kjax.robots import go1
+from kjax.types import Mode
+
+
+@pytest.fixture(scope="module")
+def both():
+    """Spec and numbers of a trot on the planar base."""
+    return resolve(load_config(RunConfig, None, {"sim.base": "planar"}), go1.PARAMS)
+
+
+def test_a_users_float32_gets_tables_that_were_made_in_float64(both):
+    spec, params = both
+    double = condense(spec, params, dtype=np.float64)
+    with jax.enable_x64(False):
+        single = condense(spec, params)
+    assert single.lmpc.F.dtype == single.params.height.dtype == np.float32
+    np.testing.assert_array_equal(single.lmpc.F, np.float32(double.lmpc.F))
+    np.testing.assert_array_equal(single.lmpc.hessian.H, np.float32(double.lmpc.hessian.H))
+
+
+def test_traced_numbers_give_the_same_tables(both):
+    spec, params = both
+    eager = condense(spec, params)
+    traced = jax.jit(lambda params: condense(spec, params))(params)
+    inside = jax.jit(lambda: condense(spec, params))()
+    for other in (traced, inside):
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12),
+            eager.lmpc,
+            other.lmpc,
+        )
+
+
+def test_a_plan_has_a_derivative_by_a_weight(both):
+    """Against central differences; away from bounds the plan is smooth."""
+    spec, params = both
+    controller = build_controller(spec)
+    seen = standing(jnp.asarray(go1.stand_pose(0.27)[1]))._replace(
+        base_vel=jnp.array([0.1, 0.0, 0.0])
+    )
+
+    def force(weight):
+        Q = jnp.asarray(params.modes.state_weights).at[Mode.TROT, 3].set(weight)
+        tables = condense(spec, params._replace(modes=params.modes._replace(state_weights=Q)))
+        state, _ = controller.plan(tables, controller.init(tables, seen), seen)
+        return state.force[:, 0].sum()
+
+    weight = float(params.modes.state_weights[Mode.TROT, 3])
+    force = jax.jit(force)
+    slope = jax.grad(force)(weight)
+    step = 1e-3 * weight
+    difference = (force(weight + step) - force(weight - step)) / (2.0 * step)
+    assert abs(slope) > 1e-2
+    np.testing.assert_allclose(slope, difference, rtol=1e-5)
+
+
+def test_numbers_that_are_condensed_already_are_not_replaced_in_tables(both):
+    spec, params = both
+    tables = condense(spec, params)
+    higher = with_params(tables, height=tables.params.height + 0.01)
+    assert higher.params.height[0] > tables.params.height[0]
+    with pytest.raises(ValueError, match=r"modes: tables are made of it; use condense"):
+        with_params(tables, modes=params.modes)
+
+
+def test_parameters_that_are_not_condensed_are_named(both):
+    spec, params = both
+    with pytest.raises(TypeError, match=r"wanted condense\(spec, params\), got ControllerParams"):
+        build_controller(spec).init(params, standing())
