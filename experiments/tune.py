@@ -32,7 +32,7 @@ from kjax.sim.closed_cost import recording_costs
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.tuning.optimise import build_objective, check_checkpoint, descend
-from kjax.tuning.space import KINDS, Space, Variables, build_space, tuned_config
+from kjax.tuning.space import TUNABLE, Space, Variables, build_space, tuned_config
 
 KEYS = {
     "trot": ("lmpc.state_weights", "lmpc.input_weight"),
@@ -143,7 +143,7 @@ def _parse() -> tuple[RunConfig, Namespace]:
         "--keys",
         nargs="+",
         metavar="KEY",
-        help=f"what to tune; the gait's weights by default; of: {', '.join(KINDS)}",
+        help=f"what to tune; the gait's weights by default; of: {', '.join(TUNABLE)}",
     )
     parser.add_argument("--scenarios", type=int, default=16, help="to descend on")
     parser.add_argument("--held-out", type=int, default=32, help="to choose the best point on")
@@ -212,7 +212,7 @@ def worsened(space: Space, factor: float, seed: int) -> Variables:
     rng = np.random.default_rng(seed)
     out = {}
     for key, one in space.start.items():
-        if KINDS[key].unit is None:
+        if TUNABLE[key].unit is None:
             out[key] = one + np.log(factor) * rng.choice([-1.0, 1.0], np.shape(one))
         else:
             out[key] = one / factor

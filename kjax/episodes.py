@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -25,8 +25,8 @@ from tqdm import tqdm
 from kjax import cli
 from kjax.config import RunConfig, to_dict
 from kjax.koopman.storage import resolve
-from kjax.sim.episode import Trajectory, fixed_part, metrics
-from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
+from kjax.sim.episode import Trajectory, metrics
+from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate, simulation_key
 
 # Called in the worker with each finished run and the file that belongs to it.
 Record = Callable[[Trajectory, Path], None]
@@ -273,20 +273,20 @@ def _episode_of_call(
 
 
 _KEPT = 4  # simulations that a process keeps
-_built: dict[RunConfig, Simulation] = {}
-_built_of: dict[RunConfig, dict[str, str]] = {}  # the files that each was built from
+_built: dict[Hashable, Simulation] = {}
+_built_of: dict[Hashable, dict[str, str]] = {}  # the files that each was built from
 
 
 def _episode(
     config: RunConfig, record: Record | None, path: Path, on_tick: OnTick | None = None
 ) -> dict[str, Any]:
     """Run one episode, in a simulation that is kept for those to come."""
-    fixed, files = fixed_part(config), file_hashes(config)
-    if fixed not in _built or _built_of.get(fixed, {}) != files:
+    key, files = simulation_key(config), file_hashes(config)
+    if key not in _built or _built_of.get(key, {}) != files:
         while len(_built) >= _KEPT:
             del _built[next(iter(_built))]
-        _built[fixed], _built_of[fixed] = build_simulation(config), files
-    run = simulate(_built[fixed], config, on_tick=on_tick)
+        _built[key], _built_of[key] = build_simulation(config), files
+    run = simulate(_built[key], config, on_tick=on_tick)
     if record is not None and not run.interrupted:
         path.parent.mkdir(parents=True, exist_ok=True)
         record(run, path)

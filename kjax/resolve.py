@@ -1,6 +1,8 @@
 """From a config to what a controller is made of: its spec (static) and its parameters (data)."""
 
 import warnings
+from collections.abc import Hashable, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from math import inf
 from typing import Any
@@ -80,6 +82,26 @@ def controller_spec(config: RunConfig) -> ControllerSpec:
     )
 
 
+@lru_cache(maxsize=8192)
+def controller_key(config: RunConfig) -> Hashable:
+    """What ``resolve`` reads of a config, but for the command and the times of gaits.
+
+    Configs with the same key have the same parameters, but for these.
+    """
+    asked = replace(config.gait, times=tuple(map(float, range(len(config.gait.times)))))
+    return (
+        config.srb,
+        config.koopman,
+        config.lmpc,
+        asked,
+        config.bound,
+        config.multiphase,
+        config.leg,
+        config.lateral,
+        config.sim.base,
+    )
+
+
 def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
     """Fit the Koopman models of a config; call it in float64.
 
@@ -148,8 +170,28 @@ def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
             )
 
 
-def gather(config: RunConfig, robot: RobotParams, fits: Fits) -> ControllerParams:
-    """Parameters from a config and its fits; the config's continuous numbers may be traced."""
+class Overlay:
+    """A config to be read with other numbers at some keys, traced ones perhaps."""
+
+    def __init__(self, config: Any, numbers: Mapping[str, Any]):
+        """The config (or a section of it), and numbers by dotted key."""
+        self._config, self._numbers = config, dict(numbers)
+
+    def __getattr__(self, name: str) -> Any:
+        """The number, the section with its numbers, or what the config holds."""
+        if name in self._numbers:
+            return self._numbers[name]
+        inside = {
+            key.removeprefix(f"{name}."): number
+            for key, number in self._numbers.items()
+            if key.startswith(f"{name}.")
+        }
+        own = getattr(self._config, name)
+        return Overlay(own, inside) if inside else own
+
+
+def gather(config: Any, robot: RobotParams, fits: Fits) -> ControllerParams:
+    """Parameters from a config, or an ``Overlay`` with traced numbers, and its fits."""
     gaits = build_gaits(config)
     names = [g.name for g in gaits]
     leg, bound, sideways = config.leg, config.bound, config.lateral

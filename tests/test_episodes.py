@@ -15,8 +15,8 @@ import pytest
 from kjax import episodes
 from kjax.config import FitStudyConfig, PushConfig, RunConfig, fields, load_config
 from kjax.koopman import storage
-from kjax.sim.episode import fixed_part, metrics
-from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.episode import metrics
+from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
 
 SHORT = {
     "sim.base": "planar",
@@ -39,7 +39,7 @@ def simulation(config):
     """Built once; the runner finds it where a worker would have left it."""
     built = build_simulation(config)
     episodes._built.clear()
-    episodes._built[fixed_part(config)] = built
+    episodes._built[simulation_key(config)] = built
     return built
 
 
@@ -243,7 +243,7 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
 
 
 def test_a_config_that_needs_another_simulation_is_refused(config, simulation):
-    with pytest.raises(ValueError, match="fixed_part"):
+    with pytest.raises(ValueError, match="simulation_key"):
         simulate(simulation, dataclasses.replace(config, bound=dataclasses.replace(
             config.bound, apex=0.1)))  # fmt: skip
 

@@ -3,6 +3,7 @@
 Every field's docstring ends with its unit in brackets; ``--help`` of the experiments shows them.
 """
 
+from kjax.config.checks import Tunable
 from kjax.config.control import (
     BoundConfig,
     CommandConfig,
@@ -12,7 +13,7 @@ from kjax.config.control import (
     LmpcConfig,
     MultiPhaseConfig,
 )
-from kjax.config.loading import ConfigError, fields, load_config, to_dict
+from kjax.config.loading import ConfigError, fields, load_config, to_dict, tunable
 from kjax.config.model import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.config.run import FitStudyConfig, RunConfig
 from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
@@ -39,7 +40,9 @@ __all__ = [
     "SrbConfig",
     "SweepConfig",
     "TerrainConfig",
+    "Tunable",
     "fields",
     "load_config",
     "to_dict",
+    "tunable",
 ]

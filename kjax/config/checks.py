@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import Annotated, Any
 
@@ -18,6 +19,31 @@ Bound = Annotated[float, Field(allow_inf_nan=True)]
 # and no joint gives more than its limit.
 Friction = Annotated[float, Field(ge=0.05, allow_inf_nan=True)]
 TorqueFraction = Annotated[float, Field(gt=0, allow_inf_nan=True)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tunable:
+    """That a number may be tuned by gradients, in which coordinate and range.
+
+    Attributes:
+      unit: a change that matters, of numbers of either sign; ``None`` for the logarithm.
+      low: least value.
+      high: largest value.
+    """
+
+    unit: float | None = None
+    low: float = 0.0
+    high: float = inf
+
+
+WEIGHT = Tunable(low=1e-12)
+FORCE = Tunable(low=1.0, high=1000.0)
+LEAST_FORCE = Tunable(unit=10.0, low=-100.0, high=100.0)
+HEIGHT = Tunable(low=0.15, high=0.33)
+GAIN = Tunable(unit=0.02, high=0.5)
+RATE = Tunable(unit=0.5, high=20.0)
+PLACE = Tunable(low=0.02, high=0.30)
+TIME = Tunable(low=0.02, high=2.0)
 
 
 def require_timeline(times: Sequence[float], name: str, values: Sequence[object]) -> None:

@@ -7,13 +7,22 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from kjax.config.checks import (
+    FORCE,
+    GAIN,
+    HEIGHT,
+    LEAST_FORCE,
+    PLACE,
+    RATE,
     STRICT,
+    TIME,
+    WEIGHT,
     Bound,
     Count,
     Friction,
     NonNegative,
     Positive,
     TorqueFraction,
+    Tunable,
     require_fraction,
     require_order,
     require_timeline,
@@ -45,30 +54,30 @@ class LmpcConfig:
     """Step of the prediction model, a multiple of koopman.dataset.dt [s]."""
     horizon: Count = 6
     """Length of the prediction, in steps of model_dt [-]."""
-    state_weights: tuple[
-        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    state_weights: Annotated[
+        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], WEIGHT
     ] = (2000.0, 3e4, 1200.0, 12.0, 3.0, 0.2)
     """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
-    input_weight: Positive = 1e-5
+    input_weight: Annotated[Positive, WEIGHT] = 1e-5
     """R of every force [1/N^2]."""
     input_reference: Literal["mean", "zero"] = "mean"
     """What R penalises the distance from: the gait's mean force, which carries the weight, or no
     force (the paper), which leaves a droop [-]."""
-    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 60.0
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 60.0
     """Bound of |F_x| per leg, body frame [N]."""
-    force_z_min: Bound = 0.0
+    force_z_min: Annotated[Bound, LEAST_FORCE] = 0.0
     """Lower bound of F_z per leg, body frame [N]."""
-    force_z_max: Bound = 160.0
+    force_z_max: Annotated[Bound, FORCE] = 160.0
     """Upper bound of F_z per leg, body frame [N]."""
-    height: Positive = 0.27
+    height: Annotated[Positive, HEIGHT] = 0.27
     """Reference height of the centre of mass above the ground under the stance feet [m]."""
     command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
     """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
-    integral_gains: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    integral_gains: Annotated[tuple[NonNegative, NonNegative], RATE] = (0.0, 0.0)
     """Rates at which the errors of velocity and pitch move their references; 0: not [1/s]."""
     integral_limits: tuple[NonNegative, NonNegative] = (0.15, 0.15)
     """Largest correction of velocity and pitch reference by that [m/s, rad]."""
-    position_slack: Positive = 0.10
+    position_slack: Annotated[Positive, Tunable(low=1e-4)] = 0.10
     """Largest lead or lag of the integrated position reference before the body [m]."""
     caution: NonNegative = 0.0
     """How much less a step of the horizon weighs where the model is less certain; 0: none [-]."""
@@ -139,32 +148,32 @@ class BoundConfig:
     """Length of the flights in the first cycle, as a fraction of the full one [-]."""
     ramp_cycles: Annotated[int, Field(ge=0)] = 10
     """Number of cycles over which the flights grow to their full length [-]."""
-    feet_front: Positive = 0.075
+    feet_front: Annotated[Positive, PLACE] = 0.075
     """Distance of the front footholds ahead of the centre of mass, standing still [m]."""
-    feet_rear: Positive = 0.148
+    feet_rear: Annotated[Positive, PLACE] = 0.148
     """Distance of the rear footholds behind the centre of mass, standing still [m]."""
     horizon: Literal["stance", "multiphase"] = "stance"
     """What the prediction covers: the present stance (the paper), or a whole cycle ([multiphase],
     which then has the weights and bounds) [-]."""
     reference: Literal["periodic", "constant"] = "periodic"
     """Reference of height and pitch: the cycle's own motion, or constant (the paper) [-]."""
-    force_edge: Annotated[float, Field(gt=0, le=0.5)] = 0.25
+    force_edge: Annotated[float, Field(gt=0, le=0.5), Tunable(low=0.02, high=0.5)] = 0.25
     """Part of a stance in which the periodic reference's force rises, and again falls [-]."""
-    height: Positive = 0.27
+    height: Annotated[Positive, HEIGHT] = 0.27
     """Mean height of the centre of mass in stance [m]."""
-    state_weights: tuple[
-        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    state_weights: Annotated[
+        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], WEIGHT
     ] = (1084.0, 1211.0, 60.0, 3.06, 3.05, 0.1)
     """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
-    input_weight: Positive = 5.7e-7
+    input_weight: Annotated[Positive, WEIGHT] = 5.7e-7
     """R of every force [1/N^2]."""
-    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 51.5
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 51.5
     """Bound of |F_x| per leg, body frame [N]."""
-    force_z_min: Bound = 20.0
+    force_z_min: Annotated[Bound, LEAST_FORCE] = 20.0
     """Lower bound of F_z per leg: a foot that carries no weight slips [N]."""
-    force_z_max: Bound = 300.0
+    force_z_max: Annotated[Bound, FORCE] = 300.0
     """Upper bound of F_z per leg, body frame [N]."""
-    velocity_gain: NonNegative = 0.075
+    velocity_gain: Annotated[NonNegative, GAIN] = 0.075
     """Raibert gain on the velocity error in the foothold [s]."""
     apex: Positive = 0.064
     """Height of the swing above the higher of lift-off and target [m]."""
@@ -181,13 +190,13 @@ class MultiPhaseConfig:
 
     node_dt: Positive = 0.0125
     """Longest node of a stance; a flight is one node [s]."""
-    state_weights: tuple[
-        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
+    state_weights: Annotated[
+        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], WEIGHT
     ] = (63.6, 190.0, 10.4, 29.0, 1.57, 0.22)
     """Q of (p_x, p_z, theta, v_x, v_z, omega), per second [1/s times that of bound]."""
-    input_weight: Positive = 5.26e-5
+    input_weight: Annotated[Positive, WEIGHT] = 5.26e-5
     """R of every force's distance from the periodic one, per second [1/(N^2 s)]."""
-    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True)] = 90.0
+    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 90.0
     """Bound of |F_x| per leg, world frame [N]."""
     force_z_min: Bound = 10.0
     """Lower bound of F_z per leg, world frame [N]."""
@@ -197,11 +206,11 @@ class MultiPhaseConfig:
     """mu of the pyramid |F_x| <= mu F_z; below the ground's, for margin [-]."""
     torque_fraction: Annotated[float, Field(gt=0, le=1)] = 0.95
     """Part of the thigh's and the calf's torque limit that planned forces may take [-]."""
-    inertia_scale: Positive = 0.937
+    inertia_scale: Annotated[Positive, Tunable(low=0.3, high=2.0)] = 0.937
     """Pitch inertia of the prediction over srb.inertia: legs in swing count for less [-]."""
-    velocity_time: Positive = 0.38
+    velocity_time: Annotated[Positive, TIME] = 0.38
     """Time in which the velocity is predicted to reach its reference, for moment arms [s]."""
-    height_time: Positive = 0.095
+    height_time: Annotated[Positive, TIME] = 0.095
     """The same of height and pitch [s]."""
     tolerance: Positive = 1e-6
     """Relative residuals and gap at which the QP counts as solved [-]."""
@@ -228,7 +237,7 @@ class LegConfig:
     """Height of the swing above the higher of lift-off and target [m]."""
     horizontal_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Part of the swing after which the foot has arrived above its foothold [-]."""
-    velocity_gain: NonNegative = 0.03
+    velocity_gain: Annotated[NonNegative, GAIN] = 0.03
     """Raibert gain on the velocity error in the foothold [s]."""
     reach_speed: NonNegative = 1.0
     """Speed at which a foot feels for the ground when a change of gait has cut its swing short;

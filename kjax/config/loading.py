@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
+from kjax.config.checks import Tunable
+
 T = TypeVar("T")
 
 
@@ -36,6 +38,16 @@ def fields(cls: type, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
             yield from fields(info.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
         else:
             yield f"{prefix}{name}", info, info.default
+
+
+def tunable(cls: type) -> dict[str, Tunable]:
+    """Keys of a config class that may be tuned, and how."""
+    return {
+        name: mark
+        for name, info, _ in fields(cls)
+        for mark in info.metadata
+        if isinstance(mark, Tunable)
+    }
 
 
 def load_config(

@@ -5,16 +5,16 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from kjax.config.checks import STRICT, Count, NonNegative, Positive
+from kjax.config.checks import STRICT, Count, NonNegative, Positive, Tunable
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SrbConfig:
     """Single rigid body that the models are fitted to; what is left out is the robot's own."""
 
-    mass: Positive | None = None
+    mass: Annotated[Positive | None, Tunable(low=1.0, high=100.0)] = None
     """Mass of the body; the robot's if left out [kg]."""
-    inertia: Positive | None = None
+    inertia: Annotated[Positive | None, Tunable(low=0.01, high=10.0)] = None
     """Pitch inertia about the centre of mass; the whole robot's in its stance if left out
     [kg m^2]."""
     feet_front: tuple[float, float] | None = None

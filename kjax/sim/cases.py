@@ -5,8 +5,8 @@ Two configs may share a compiled batch if their ``batch_spec`` is the same: what
 leading axis B.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -15,15 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from kjax.config import (
-    CommandConfig,
-    NoiseConfig,
-    PushConfig,
     RunConfig,
-    SimConfig,
-    TerrainConfig,
 )
 from kjax.params import Tables, condense, with_params
-from kjax.resolve import controller_spec, resolve
+from kjax.resolve import controller_key, controller_spec, resolve
 from kjax.robots import go1
 from kjax.sim.episode import origin
 from kjax.sim.excitation import force_deviation
@@ -96,9 +91,14 @@ class BatchSpec:
     scene: SceneSpec
 
 
-@lru_cache(maxsize=8192)
 def batch_spec(config: RunConfig) -> BatchSpec:
     """Spec of a config: those with an equal one may walk in one compiled batch."""
+    # What a file holds may have changed since.
+    return _batch_spec.__wrapped__(config) if config.koopman.file else _batch_spec(config)
+
+
+@lru_cache(maxsize=8192)
+def _batch_spec(config: RunConfig) -> BatchSpec:
     sim, terrain, noise = config.sim, config.terrain, config.noise
     scene = SceneSpec(
         base=sim.base,
@@ -164,8 +164,8 @@ def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]
     Returns:
       The tables, and for each leaf 0 or ``None``: ``vmap``'s ``in_axes``.
     """
-    built: dict[RunConfig, Tables] = {}
-    kinds = [_params_part(config) for config in configs]
+    built: dict[Hashable, Tables] = {}
+    kinds = [controller_key(config) for config in configs]
     for kind, config in zip(kinds, configs, strict=True):
         if kind not in built:
             spec, params = resolve(config, go1.PARAMS)
@@ -204,22 +204,6 @@ def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]
     stacked = hollow(jax.tree.map(stack, *shared), commands, gait_times, gait_names)
     own_axes = hollow(axes, Command(0, 0), 0, 0)  # type: ignore[arg-type]
     return jax.tree.map(jnp.asarray, stacked), own_axes
-
-
-@lru_cache(maxsize=8192)
-def _params_part(config: RunConfig) -> RunConfig:
-    """What controller parameters come from, but for command and times of requests."""
-    return replace(
-        config,
-        seed=0,
-        duration=1.0,
-        command=CommandConfig(times=(0.0,), velocities=(0.0,)),
-        gait=replace(config.gait, times=tuple(map(float, range(len(config.gait.times))))),
-        noise=NoiseConfig(),
-        push=PushConfig(),
-        terrain=TerrainConfig(),
-        sim=SimConfig(base=config.sim.base, sim_dt=config.sim.sim_dt),
-    )
 
 
 def _filled(values: Any, count: int, rest: Any) -> np.ndarray:

@@ -1,6 +1,6 @@
 """What an episode starts from and what it leaves: initial state, noise, trajectory, metrics."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,12 @@ from jaxtyping import Int
 
 from kjax import qp
 from kjax.config import (
-    CommandConfig,
-    NoiseConfig,
-    PushConfig,
     RunConfig,
     SimConfig,
-    TerrainConfig,
 )
 from kjax.legs.base import build_base
 from kjax.robots import go1
 from kjax.sim import free_base
-from kjax.sim.excitation import without_size
 from kjax.sim.observe import NOISE_DIM, Observe, noise_dim, noise_scale
 from kjax.walkable import build_gaits
 
@@ -102,36 +97,6 @@ class Trajectory:
         ):
             values[name] = kind(values[name])
         return cls(**values)
-
-
-def fixed_part(config: RunConfig) -> RunConfig:
-    """The config without what may differ between the episodes of one compiled simulation.
-
-    That is the seed, duration, noise (but for whether it perturbs forces), pushes, times and speeds
-    of the command, times of the gaits, friction, payload, delay, place and heading of the start,
-    and the terrain's seed and sizes. Configs with the same fixed part share a
-    ``mujoco_loop.Simulation``.
-    """
-    pieces = tuple(map(float, range(len(config.command.times))))
-    return replace(
-        config,
-        seed=0,
-        duration=1.0,
-        noise=NoiseConfig(force=without_size(config.noise)),
-        push=PushConfig(),
-        command=CommandConfig(times=pieces, velocities=pieces),
-        gait=replace(config.gait, times=tuple(map(float, range(len(config.gait.times))))),
-        sim=replace(
-            config.sim,
-            friction=1.0,
-            payload=0.0,
-            delay=0.0,
-            start=(0.0, 0.0),
-            heading=0.0,
-            floor=0.0,
-        ),
-        terrain=TerrainConfig(kind=config.terrain.kind, count=config.terrain.count),
-    )
 
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:

@@ -21,11 +21,6 @@ def force_deviation(noise: NoiseConfig) -> float:
     return noise.force * noise.enabled
 
 
-def without_size(noise: NoiseConfig) -> float:
-    """A value of ``noise.force`` that says only whether forces are perturbed: 1 or 0."""
-    return float(force_deviation(noise) > 0)
-
-
 def force_row(seed: Int[Array, ""], step: Int[Array, ""]) -> Float[Array, "4"]:
     """Standard normal vector (front x, z, rear x, z) of the tick that begins at a physics step."""
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), _STREAM), step)

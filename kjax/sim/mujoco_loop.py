@@ -4,7 +4,7 @@ import dataclasses
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -17,13 +17,13 @@ from jaxtyping import Array
 from kjax.config import RunConfig
 from kjax.controller import Controller, build_controller
 from kjax.params import Tables, condense, with_params
-from kjax.resolve import resolve
+from kjax.resolve import controller_key, resolve
 from kjax.robots import go1
 from kjax.sim import free_base
+from kjax.sim.cases import batch_spec
 from kjax.sim.episode import (
     Trajectory,
     fallen,
-    fixed_part,
     initial_state,
     origin,
     sagittal,
@@ -88,7 +88,7 @@ def requests(config: RunConfig) -> Requests:
 
 
 class Simulation(NamedTuple):
-    """Everything compiled and built for one config, and for all with the same ``fixed_part``.
+    """Everything compiled and built for one config, and for all with the same ``simulation_key``.
 
     The jitted calls take one flat vector of sensor values (qpos, qvel, sensordata, noise, and where
     forces are perturbed what is added to them) and keep the controller state and the episode's
@@ -118,6 +118,18 @@ class Simulation(NamedTuple):
     plan: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
     act: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
     unpack_log: Callable[[np.ndarray], TickLog]
+
+
+def simulation_key(config: RunConfig) -> Hashable:
+    """What the episodes of one compiled simulation share: specs and the controller's numbers.
+
+    Not the seed, duration, noise (but for whether it perturbs forces), pushes, times and speeds of
+    the command, times of the gaits, friction, payload, delay, place and heading of the start, and
+    the terrain's seed and sizes.
+    """
+    spec = batch_spec(config)
+    scene = dataclasses.replace(spec.scene, noise=True)  # noise is handed over from outside
+    return spec.controller, scene, controller_key(config), len(config.command.times)
 
 
 def build_simulation(config: RunConfig) -> Simulation:
@@ -259,8 +271,8 @@ def simulate(
       ValueError: for a config that needs another simulation.
     """
     config = simulation.config if config is None else config
-    if fixed_part(config) != fixed_part(simulation.config):
-        raise ValueError("the simulation was built from a config with another episode.fixed_part")
+    if simulation_key(config) != simulation_key(simulation.config):
+        raise ValueError("the simulation was built from a config with another simulation_key")
     if seed is not None:
         config = dataclasses.replace(config, seed=seed)
     model, at = simulation.model, simulation.addresses

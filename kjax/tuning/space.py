@@ -6,9 +6,7 @@ numbers of a controller by the same code that builds them from a config, and may
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, replace
-from math import inf
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -16,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from kjax.config import RunConfig, load_config, to_dict
+from kjax.config import RunConfig, Tunable, load_config, to_dict, tunable
 from kjax.koopman.families import BodyModel
 from kjax.params import ControllerParams, Fits, cast
-from kjax.resolve import fit_models, gather
+from kjax.resolve import Overlay, fit_models, gather
 from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import RobotParams
@@ -27,52 +25,7 @@ from kjax.types import RobotParams
 Variables = dict[str, Array]  # by key
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kind:
-    """How the numbers of a key are turned into variables.
-
-    Attributes:
-      unit: a change that matters, of numbers of either sign; ``None`` for the logarithm.
-      low: least value.
-      high: largest value.
-    """
-
-    unit: float | None = None
-    low: float = 0.0
-    high: float = inf
-
-
-_WEIGHTS = Kind(low=1e-12)
-_FORCE = Kind(low=1.0, high=1000.0)
-KINDS: dict[str, Kind] = {
-    "lmpc.state_weights": _WEIGHTS,
-    "lmpc.input_weight": _WEIGHTS,
-    "lmpc.force_x_max": _FORCE,
-    "lmpc.force_z_min": Kind(unit=10.0, low=-100.0, high=100.0),
-    "lmpc.force_z_max": _FORCE,
-    "lmpc.height": Kind(low=0.15, high=0.33),
-    "lmpc.position_slack": Kind(low=1e-4),
-    "lmpc.integral_gains": Kind(unit=0.5, high=20.0),
-    "leg.velocity_gain": Kind(unit=0.02, high=0.5),
-    "bound.state_weights": _WEIGHTS,
-    "bound.input_weight": _WEIGHTS,
-    "bound.force_x_max": _FORCE,
-    "bound.force_z_min": Kind(unit=10.0, low=-100.0, high=100.0),
-    "bound.force_z_max": _FORCE,
-    "bound.height": Kind(low=0.15, high=0.33),
-    "bound.velocity_gain": Kind(unit=0.02, high=0.5),
-    "bound.feet_front": Kind(low=0.02, high=0.30),
-    "bound.feet_rear": Kind(low=0.02, high=0.30),
-    "bound.force_edge": Kind(low=0.02, high=0.5),
-    "multiphase.state_weights": _WEIGHTS,
-    "multiphase.input_weight": _WEIGHTS,
-    "multiphase.force_x_max": _FORCE,
-    "multiphase.inertia_scale": Kind(low=0.3, high=2.0),
-    "multiphase.velocity_time": Kind(low=0.02, high=2.0),
-    "multiphase.height_time": Kind(low=0.02, high=2.0),
-    "srb.mass": Kind(low=1.0, high=100.0),
-    "srb.inertia": Kind(low=0.01, high=10.0),
-}
+TUNABLE = tunable(RunConfig)
 
 
 class Space(NamedTuple):
@@ -81,7 +34,7 @@ class Space(NamedTuple):
     Attributes:
       start: variables of the config itself.
       values: variables -> numbers by key.
-      inside: variables -> the nearest ones in the ranges of ``KINDS``.
+      inside: variables -> the nearest ones in the ranges of ``TUNABLE``.
       params: variables -> controller parameters; differentiable.
       overrides: variables -> plain values by key, for ``config.load_config`` and TOML.
     """
@@ -107,7 +60,7 @@ def build_space(
 
     Args:
       config: that all other numbers come from.
-      keys: of ``KINDS``.
+      keys: of ``TUNABLE``.
       robot: whose controller it is.
       fits: models; those of the config if ``None``.
 
@@ -117,8 +70,8 @@ def build_space(
     if not keys:
         raise ValueError("keys must name at least one variable, got none")
     for key in keys:
-        if key not in KINDS:
-            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(KINDS)}")
+        if key not in TUNABLE:
+            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(TUNABLE)}")
         if key.startswith("srb.") and config.koopman.model not in ("srb", "planted", "exact"):
             raise ValueError(
                 f"keys: '{key}' is a variable of koopman.model 'srb', 'planted' and 'exact' only, "
@@ -132,13 +85,13 @@ def build_space(
 
     def values(variables: Variables) -> dict[str, Array]:
         return {
-            key: jnp.exp(one) if (unit := KINDS[key].unit) is None else one * unit
+            key: jnp.exp(one) if (unit := TUNABLE[key].unit) is None else one * unit
             for key, one in variables.items()
         }
 
     def inside(variables: Variables) -> Variables:
         return {
-            key: jnp.clip(one, *(_forward(KINDS[key], edge) for edge in _range(KINDS[key])))
+            key: jnp.clip(one, *(_forward(TUNABLE[key], edge) for edge in _range(TUNABLE[key])))
             for key, one in variables.items()
         }
 
@@ -156,7 +109,7 @@ def build_space(
             )
             model = own.prediction.numbers._replace(body=body)
             own = own._replace(prediction=own.prediction._replace(numbers=model))
-        return cast(gather(_with_numbers(config, numbers), robot, own), dtype)
+        return cast(gather(Overlay(config, numbers), robot, own), dtype)
 
     def overrides(variables: Variables) -> dict[str, Any]:
         return {key: np.asarray(one, float).tolist() for key, one in values(variables).items()}
@@ -165,9 +118,9 @@ def build_space(
     for key in keys:
         section, name = key.split(".")
         number = np.asarray(getattr(getattr(config, section), name), float)
-        if KINDS[key].unit is None and not (number > 0).all():
+        if TUNABLE[key].unit is None and not (number > 0).all():
             raise ValueError(f"{key} must be positive to be tuned, got {number.tolist()}")
-        start[key] = jnp.asarray(_forward(KINDS[key], number), dtype)
+        start[key] = jnp.asarray(_forward(TUNABLE[key], number), dtype)
     return Space(start, values, inside, params, overrides)
 
 
@@ -183,21 +136,10 @@ def tuned_config(config: RunConfig, overrides: Mapping[str, Any]) -> RunConfig:
     return load_config(RunConfig, None, {**flat, **overrides})
 
 
-def _forward(kind: Kind, number: Any) -> Any:
+def _forward(kind: Tunable, number: Any) -> Any:
     with np.errstate(divide="ignore"):
         return np.log(number) if kind.unit is None else np.asarray(number) / kind.unit
 
 
-def _range(kind: Kind) -> tuple[float, float]:
+def _range(kind: Tunable) -> tuple[float, float]:
     return kind.low, kind.high
-
-
-def _with_numbers(config: RunConfig, numbers: Mapping[str, Any]) -> RunConfig:
-    """The config with other numbers, traced ones perhaps, that no check has seen; to be read."""
-    out = copy(config)
-    for key, number in numbers.items():
-        section, name = key.split(".")
-        own = copy(getattr(out, section))
-        object.__setattr__(own, name, number)
-        object.__setattr__(out, section, own)
-    return out

@@ -8,8 +8,8 @@ import pytest
 
 from kjax.config import RunConfig, load_config
 from kjax.sim.batch_loop import BatchEngine, dressed
-from kjax.sim.episode import fixed_part, initial_state, metrics
-from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.episode import initial_state, metrics
+from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
 
 pytestmark = pytest.mark.slow
 
@@ -82,7 +82,7 @@ def test_physics_is_that_of_single_robots_to_the_last_bit(held, held_recording, 
 def test_closed_loops_are_those_of_single_runs(recording, configs):
     simulations = {}
     for i, config in enumerate(configs):
-        fixed = fixed_part(config)
+        fixed = simulation_key(config)
         if fixed not in simulations:
             simulations[fixed] = build_simulation(config)
         alone = simulate(simulations[fixed], config)

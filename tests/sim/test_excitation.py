@@ -10,9 +10,8 @@ import pytest
 from kjax.config import RunConfig, load_config
 from kjax.sim import cases
 from kjax.sim.batch_loop import BatchEngine
-from kjax.sim.episode import fixed_part
 from kjax.sim.excitation import force_noise, force_row, perturb
-from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
 
 SHORT = {
     "sim.base": "planar",
@@ -50,10 +49,10 @@ def test_noise_depends_on_the_seed_and_the_tick_and_has_the_size_asked_for():
 def test_only_whether_forces_are_perturbed_is_compiled_in():
     off = {"noise.force": 0.0}
     none = {"noise.enabled": False}
-    for part in (cases.batch_spec, fixed_part):
+    for part in (cases.batch_spec, simulation_key):
         assert part(config()) == part(config(**{"noise.force": 3.0}))
         assert part(config()) != part(config(**off))
-    assert fixed_part(config(**none)) == fixed_part(config(**off))
+    assert simulation_key(config(**none)) == simulation_key(config(**off))
     assert cases.batch_spec(config(**none)) == cases.batch_spec(config(**off, **none))
 
 

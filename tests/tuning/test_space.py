@@ -8,7 +8,7 @@ import pytest
 from kjax import RunConfig, load_config
 from kjax.resolve import resolve
 from kjax.robots import go1
-from kjax.tuning.space import KINDS, build_space, tuned_config
+from kjax.tuning.space import TUNABLE, build_space, tuned_config
 
 BOUND = load_config(RunConfig, None, {"gait.names": ["bound"]})
 SOME = ("lmpc.state_weights", "lmpc.force_z_min", "leg.velocity_gain", "bound.feet_front",
@@ -26,7 +26,7 @@ def test_the_variables_of_a_config_give_its_own_parameters():
 
 
 def test_every_kind_of_number_exists_in_the_config_and_comes_back():
-    free = [key for key in KINDS if not key.startswith("srb.")]
+    free = [key for key in TUNABLE if not key.startswith("srb.")]
     space = build_space(BOUND, free)
     assert tuned_config(BOUND, space.overrides(space.start)) == pytest.approx(BOUND) or all(
         np.allclose(getattr(getattr(BOUND, section), name), value, rtol=1e-12)
@@ -55,8 +55,8 @@ def test_variables_are_brought_back_into_what_a_config_may_hold():
     space = build_space(BOUND, ["bound.force_edge", "bound.velocity_gain"])
     far = {key: one + 100.0 for key, one in space.start.items()}
     inside = space.overrides(space.inside(far))
-    assert inside["bound.force_edge"] == pytest.approx(KINDS["bound.force_edge"].high)
-    assert inside["bound.velocity_gain"] == pytest.approx(KINDS["bound.velocity_gain"].high)
+    assert inside["bound.force_edge"] == pytest.approx(TUNABLE["bound.force_edge"].high)
+    assert inside["bound.velocity_gain"] == pytest.approx(TUNABLE["bound.velocity_gain"].high)
     tuned_config(BOUND, inside)  # is valid
 
 
