@@ -1,7 +1,7 @@
 """From a config to what a controller is made of: its spec (static) and its parameters (data)."""
 
 import warnings
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import inf
@@ -10,17 +10,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from kjax import gait
-from kjax.config import KoopmanConfig, RunConfig, SrbConfig
+from kjax.config import KoopmanConfig, Overlay, RunConfig, SrbConfig
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import fit_modes, srb_params
 from kjax.koopman.prediction import build_prediction, model_spec
 from kjax.koopman.validate import force_response_error
 from kjax.legs import lateral, swing
 from kjax.mpc import multiphase
-from kjax.mpc.lmpc import mode_settings
+from kjax.mpc.lmpc import ModeSettings
 from kjax.params import ControllerParams, Fits
 from kjax.rigid_body import body_numbers, mean_force, own_body
 from kjax.spec import ControllerSpec, CycleSpec
@@ -170,27 +170,7 @@ def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
             )
 
 
-class Overlay:
-    """A config to be read with other numbers at some keys, traced ones perhaps."""
-
-    def __init__(self, config: Any, numbers: Mapping[str, Any]):
-        """The config (or a section of it), and numbers by dotted key."""
-        self._config, self._numbers = config, dict(numbers)
-
-    def __getattr__(self, name: str) -> Any:
-        """The number, the section with its numbers, or what the config holds."""
-        if name in self._numbers:
-            return self._numbers[name]
-        inside = {
-            key.removeprefix(f"{name}."): number
-            for key, number in self._numbers.items()
-            if key.startswith(f"{name}.")
-        }
-        own = getattr(self._config, name)
-        return Overlay(own, inside) if inside else own
-
-
-def gather(config: Any, robot: RobotParams, fits: Fits) -> ControllerParams:
+def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> ControllerParams:
     """Parameters from a config, or an ``Overlay`` with traced numbers, and its fits."""
     gaits = build_gaits(config)
     names = [g.name for g in gaits]
@@ -254,8 +234,34 @@ def gather(config: Any, robot: RobotParams, fits: Fits) -> ControllerParams:
 _fit_modes = jax.jit(fit_modes, static_argnames="config")
 
 
+def mode_settings(lmpc: Any, bound: Any, mean_force: Float[Array, "M 2"]) -> ModeSettings:
+    """Settings per mode: the bound's own in front and rear stance, the LMPC's elsewhere.
+
+    Args:
+      lmpc: section of the config, or an ``Overlay``: weights and bounds.
+      bound: likewise, of front and rear stance.
+      mean_force: (M, 2) F_z per front and rear leg that R penalises the distance from [N].
+    """
+    single = np.isin(np.arange(len(Mode)), [Mode.FRONT, Mode.REAR])[:, None]
+    standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
+
+    def chosen(of: Callable[[Any], Sequence[float]]) -> Array:
+        return jnp.where(single, jnp.asarray(of(bound), float), jnp.asarray(of(lmpc), float))
+
+    hover = jnp.stack([jnp.zeros_like(mean_force), mean_force], axis=-1).reshape(len(Mode), 4)
+    lower = chosen(lambda config: [-config.force_x_max, config.force_z_min] * 2)
+    upper = chosen(lambda config: [config.force_x_max, config.force_z_max] * 2)
+    return ModeSettings(
+        state_weights=chosen(lambda config: config.state_weights),
+        input_weights=chosen(lambda config: [config.input_weight] * 4),
+        lower=jnp.where(standing, lower, 0.0),
+        upper=jnp.where(standing, upper, 0.0),
+        input_reference=jnp.where(standing, hover, 0.0),
+    )
+
+
 def multiphase_params(
-    gaits: list[gait.Gait], config: RunConfig, robot: RobotParams
+    gaits: list[gait.Gait], config: RunConfig | Overlay, robot: RobotParams
 ) -> multiphase.MultiPhaseParams:
     """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
     chosen, bound = config.multiphase, config.bound
@@ -277,7 +283,9 @@ def multiphase_params(
     )
 
 
-def _reference_tables(gaits: list[gait.Gait], config: RunConfig, mass: Any, inertia: Any) -> Array:
+def _reference_tables(
+    gaits: list[gait.Gait], config: RunConfig | Overlay, mass: Any, inertia: Any
+) -> Array:
     """Periodic motion of every gait at every ramp level; zero but for a bound that wants one."""
     bound = config.bound
     levels = 1 + max(g.ramp_cycles for g in gaits)
@@ -302,7 +310,7 @@ def _reference_tables(gaits: list[gait.Gait], config: RunConfig, mass: Any, iner
     return rows
 
 
-def _bound_offset(robot: RobotParams, config: RunConfig) -> Array:
+def _bound_offset(robot: RobotParams, config: RunConfig | Overlay) -> Array:
     """Foothold of a bound ahead of the hip, standing still, for each leg [m]."""
     wanted = [config.bound.feet_front] * 2 + [-config.bound.feet_rear] * 2
     return jnp.stack([jnp.asarray(one, float) for one in wanted]) - robot.hip_pos[:, 0]

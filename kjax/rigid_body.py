@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kjax.config import RunConfig, SrbConfig
+from kjax.config import Overlay, RunConfig, SrbConfig
 from kjax.legs import kinematics
 from kjax.observation import standing
 from kjax.types import GRAVITY, Mode, RobotParams
@@ -61,7 +61,7 @@ def _standing_com(robot: RobotParams, height: float) -> tuple[Array, Array]:
     return jax.lax.fori_loop(0, 20, again, jnp.zeros(2)), hips
 
 
-def body_numbers(config: RunConfig, robot: RobotParams) -> tuple[Any, Any]:
+def body_numbers(config: RunConfig | Overlay, robot: RobotParams) -> tuple[Any, Any]:
     """Mass [kg] and pitch inertia [kg m^2] of the prediction; may be traced."""
     srb = config.srb
     return (
@@ -70,7 +70,7 @@ def body_numbers(config: RunConfig, robot: RobotParams) -> tuple[Any, Any]:
     )
 
 
-def mean_force(config: RunConfig, mass: Any) -> Float[Array, "M 2"]:
+def mean_force(config: RunConfig | Overlay, mass: Any) -> Float[Array, "M 2"]:
     """Vertical force of one front and one rear leg in every contact mode, mean of its stance [N].
 
     In a gait without flight the stance legs share the weight; flights add what they leave out, and

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 from kjax import gait
-from kjax.config import RunConfig
+from kjax.config import Overlay, RunConfig
 from kjax.legs.kinematics import REACH
 from kjax.rigid_body import nominal_feet, own_body
 from kjax.types import GRAVITY, MODE_ALPHA, Mode, RobotParams
@@ -15,7 +15,7 @@ FACTOR = {"mass": 2.0, "inertia": 4.0}  # from the robot's own that srb may be
 MASS_TOLERANCE = 0.01  # relative; below it srb.mass counts as the robot's own
 
 
-def build_gaits(config: RunConfig) -> list[gait.Gait]:
+def build_gaits(config: RunConfig | Overlay) -> list[gait.Gait]:
     """The gaits of a config, in the order of their indices: trot, bound, stand, landing."""
     chosen, bound = config.gait, config.bound
     landing = "landing" if chosen.landing_time > 0 else ""
@@ -36,7 +36,7 @@ def build_gaits(config: RunConfig) -> list[gait.Gait]:
     return [*gaits, gait.stand(chosen.landing_time, name=landing)] if landing else gaits
 
 
-def cycle_nodes(gaits: list[gait.Gait], config: RunConfig) -> np.ndarray:
+def cycle_nodes(gaits: list[gait.Gait], config: RunConfig | Overlay) -> np.ndarray:
     """Number of nodes (G, P) of each phase; zero for gaits that predict within a stance only."""
     nodes = np.zeros((len(gaits), max(len(g.phases) for g in gaits)), int)
     for index, one in enumerate(gaits):

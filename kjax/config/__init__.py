@@ -13,7 +13,7 @@ from kjax.config.control import (
     LmpcConfig,
     MultiPhaseConfig,
 )
-from kjax.config.loading import ConfigError, fields, load_config, to_dict, tunable
+from kjax.config.loading import ConfigError, Overlay, fields, load_config, to_dict, tunable
 from kjax.config.model import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.config.run import FitStudyConfig, RunConfig
 from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
@@ -34,6 +34,7 @@ __all__ = [
     "LmpcConfig",
     "MultiPhaseConfig",
     "NoiseConfig",
+    "Overlay",
     "PushConfig",
     "RunConfig",
     "SimConfig",

@@ -50,6 +50,26 @@ def tunable(cls: type) -> dict[str, Tunable]:
     }
 
 
+class Overlay:
+    """A config to be read with other numbers at some keys, traced ones perhaps."""
+
+    def __init__(self, config: Any, numbers: Mapping[str, Any]):
+        """The config (or a section of it), and numbers by dotted key."""
+        self._config, self._numbers = config, dict(numbers)
+
+    def __getattr__(self, name: str) -> Any:
+        """The number, the section with its numbers, or what the config holds."""
+        if name in self._numbers:
+            return self._numbers[name]
+        inside = {
+            key.removeprefix(f"{name}."): number
+            for key, number in self._numbers.items()
+            if key.startswith(f"{name}.")
+        }
+        own = getattr(self._config, name)
+        return Overlay(own, inside) if inside else own
+
+
 def load_config(
     cls: type[T], path: str | Path | None = None, overrides: Mapping[str, Any] | None = None
 ) -> T:

@@ -4,7 +4,6 @@ On line a plan is: lift, one matrix-vector product for the linear term, one box 
 forces are checked at its solution; only where one is violated a QP with rows follows.
 """
 
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,12 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from kjax import qp
-from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman.models import LinearModel, aggregate, input_map
 from kjax.mpc.condense import cautious_weights, condense
 from kjax.mpc.limits import ForceRows
 from kjax.spec import ControllerSpec
-from kjax.types import MODE_ALPHA, Mode
 
 
 class LmpcTables(NamedTuple):
@@ -81,36 +78,6 @@ class ModeSettings(NamedTuple):
     lower: Float[Array, "M 4"]
     upper: Float[Array, "M 4"]
     input_reference: Float[Array, "M 4"]
-
-
-def mode_settings(
-    lmpc: LmpcConfig, bound: BoundConfig, mean_force: Float[Array, "M 2"]
-) -> ModeSettings:
-    """Settings per mode: the bound's own in front and rear stance, the LMPC's elsewhere.
-
-    The configs' numbers may be traced.
-
-    Args:
-      lmpc: weights and bounds.
-      bound: those of front and rear stance.
-      mean_force: (M, 2) F_z per front and rear leg that R penalises the distance from [N].
-    """
-    single = np.isin(np.arange(len(Mode)), [Mode.FRONT, Mode.REAR])[:, None]
-    standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
-
-    def chosen(of: Callable[[LmpcConfig | BoundConfig], Sequence[float]]) -> Array:
-        return jnp.where(single, jnp.asarray(of(bound), float), jnp.asarray(of(lmpc), float))
-
-    hover = jnp.stack([jnp.zeros_like(mean_force), mean_force], axis=-1).reshape(len(Mode), 4)
-    lower = chosen(lambda config: [-config.force_x_max, config.force_z_min] * 2)
-    upper = chosen(lambda config: [config.force_x_max, config.force_z_max] * 2)
-    return ModeSettings(
-        state_weights=chosen(lambda config: config.state_weights),
-        input_weights=chosen(lambda config: [config.input_weight] * 4),
-        lower=jnp.where(standing, lower, 0.0),
-        upper=jnp.where(standing, upper, 0.0),
-        input_reference=jnp.where(standing, hover, 0.0),
-    )
 
 
 def build_tables(

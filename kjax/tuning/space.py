@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from kjax.config import RunConfig, Tunable, load_config, to_dict, tunable
+from kjax.config import Overlay, RunConfig, Tunable, load_config, to_dict, tunable
 from kjax.koopman.families import BodyModel
 from kjax.params import ControllerParams, Fits, cast
-from kjax.resolve import Overlay, fit_models, gather
+from kjax.resolve import fit_models, gather
 from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import RobotParams

@@ -16,6 +16,7 @@ from kjax.legs.kinematics import LegTrig, leg_trig
 from kjax.mpc import lmpc
 from kjax.mpc.limits import force_limits
 from kjax.qp import Status
+from kjax.resolve import mode_settings
 from kjax.robots import go1
 from kjax.spec import ControllerSpec
 from kjax.types import MODE_ALPHA, Mode
@@ -65,7 +66,7 @@ def build(model, feet, config, bound):
     wanted = (config.input_reference == "mean") * MASS * G / legs * np.ones((1, 2))
     return condense_all(
         model,
-        lmpc.mode_settings(config, bound, jnp.asarray(wanted)),
+        mode_settings(config, bound, jnp.asarray(wanted)),
         steps=round(config.model_dt / DT),
         horizon=config.horizon,
         feet=jnp.tile(feet, (len(Mode), 1, 1)),
@@ -287,7 +288,7 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
 @pytest.mark.parametrize("mode", list(Mode))
 def test_the_mean_force_becomes_the_input_reference_of_standing_legs(mode):
     force = 10.0 + np.arange(10.0).reshape(len(Mode), 2)
-    settings = lmpc.mode_settings(FREE, FREE_BOUND, jnp.asarray(force))
+    settings = mode_settings(FREE, FREE_BOUND, jnp.asarray(force))
     lower, upper, reference = (
         a[mode].reshape(2, 2) for a in (settings.lower, settings.upper, settings.input_reference)
     )
@@ -302,7 +303,7 @@ def test_the_mean_force_becomes_the_input_reference_of_standing_legs(mode):
 
 @pytest.mark.parametrize("mode", list(Mode))
 def test_front_and_rear_stance_have_the_bound_s_weights_and_limits_and_the_others_their_own(mode):
-    settings = lmpc.mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
+    settings = mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
     single = mode in (Mode.FRONT, Mode.REAR)
     weights = [900.0, 1e4, 500.0, 5.0, 2.0, 0.2] if single else list(BOUNDED.state_weights)
     np.testing.assert_array_equal(settings.state_weights[mode], weights)
@@ -315,7 +316,7 @@ def test_front_and_rear_stance_have_the_bound_s_weights_and_limits_and_the_other
 
 def test_the_contact_points_of_each_mode_enter_its_own_tables(fitted_moving_feet, body):
     model = fitted_moving_feet[0]
-    settings = lmpc.mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
+    settings = mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
     arguments = {"steps": 5, "horizon": 4}
     same = jnp.tile(body.feet, (len(Mode), 1, 1))
     moved = same.at[Mode.FRONT, 0, 0].add(0.05)
