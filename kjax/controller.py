@@ -78,6 +78,8 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
       spec: from ``kjax.resolve``.
       planner: of forces; that of the spec if ``None``.
     """
+    if not isinstance(spec, ControllerSpec):
+        raise TypeError(f"spec: wanted that of kjax.resolve, got {type(spec).__name__}")
     control_dt, act_dt = spec.control_dt, spec.act_dt
     base = build_base(spec.base)
     plan_forces = build_planner(spec) if planner is None else planner

@@ -109,6 +109,8 @@ def condense(spec: ControllerSpec, params: ControllerParams, *, dtype: Any = Non
       params: its numbers, from ``kjax.resolve`` or changed since.
       dtype: floating type of the result; JAX's current default if ``None``.
     """
+    if not isinstance(params, ControllerParams):
+        raise TypeError(f"params: wanted those of kjax.resolve, got {type(params).__name__}")
     dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
     if not is_concrete((params, jnp.zeros(()))):  # the latter is traced inside jit, whatever params
         return cast(Tables(params, _condensed(spec, params)), dtype)

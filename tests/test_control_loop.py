@@ -3,6 +3,7 @@
 import warnings
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -82,6 +83,25 @@ def test_the_first_torque_is_of_the_first_sample(loop_of, kind):
                   for k, v in sample()._asdict().items()}  # fmt: skip
         loop.step(Observation(**values), 0.001 * i)
     assert stub.traced == 3
+
+
+def test_nothing_is_compiled_at_the_first_sample(loop_of):
+    compiled = []
+
+    def listen(event, seconds, **_):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(seconds)
+
+    jax.clear_caches()
+    loop = loop_of(Stub())
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        loop.step(sample(), 0.0)
+        assert compiled == []
+        jax.jit(lambda x: x + 1.0)(1.0)
+        assert len(compiled) == 1  # it does listen
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def test_it_plans_at_the_control_rate_whatever_clock_it_is_given(loop_of):

@@ -73,7 +73,11 @@ def test_numbers_that_are_condensed_already_are_not_replaced_in_tables(both):
         with_params(tables, modes=params.modes)
 
 
-def test_parameters_that_are_not_condensed_are_named(both):
+def test_what_belongs_elsewhere_is_named(both):
     spec, params = both
     with pytest.raises(TypeError, match=r"wanted condense\(spec, params\), got ControllerParams"):
         build_controller(spec).init(params, standing())
+    with pytest.raises(TypeError, match=r"spec: wanted that of kjax\.resolve, got RunConfig"):
+        build_controller(RunConfig())
+    with pytest.raises(TypeError, match=r"params: wanted those of kjax\.resolve, got RunConfig"):
+        condense(spec, RunConfig())
