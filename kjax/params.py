@@ -125,10 +125,16 @@ def with_params(tables: Tables, **changes: Any) -> Tables:
     Raises:
       ValueError: for numbers that the LMPC's tables are made of: ``condense`` them again.
     """
+    params = tables.params
     condensed = sorted({"fits", "modes", "caution"} & changes.keys())
     if condensed:
         raise ValueError(f"{', '.join(condensed)}: tables are made of it; use condense")
-    return tables._replace(params=tables.params._replace(**changes))
+    # In the type that is there: else every function compiles again.
+    changes = {
+        name: jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), new, getattr(params, name))
+        for name, new in changes.items()
+    }
+    return tables._replace(params=params._replace(**changes))
 
 
 @partial(jax.jit, static_argnums=0)

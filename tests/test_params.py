@@ -69,6 +69,10 @@ def test_numbers_that_are_condensed_already_are_not_replaced_in_tables(both):
     tables = condense(spec, params)
     higher = with_params(tables, height=tables.params.height + 0.01)
     assert higher.params.height[0] > tables.params.height[0]
+    assert (
+        with_params(tables, height=np.full(3, 0.25)).params.height.dtype
+        == tables.params.height.dtype
+    )
     with pytest.raises(ValueError, match=r"modes: tables are made of it; use condense"):
         with_params(tables, modes=params.modes)
 

@@ -17,7 +17,7 @@ import numpy as np
 from kjax.config import (
     RunConfig,
 )
-from kjax.params import Tables, condense, with_params
+from kjax.params import Tables, condense
 from kjax.resolve import controller_key, controller_spec, resolve
 from kjax.robots import go1
 from kjax.sim.episode import origin
@@ -188,9 +188,8 @@ def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]
     times, velocities, gait_times, gait_names = map(np.stack, zip(*own, strict=True))
 
     def hollow(tables: Tables, *fields: Any) -> Any:
-        return with_params(
-            tables, **dict(zip(("command", "gait_times", "gaits"), fields, strict=True))
-        )
+        new = dict(zip(("command", "gait_times", "gaits"), fields, strict=True))
+        return tables._replace(params=tables.params._replace(**new))
 
     def stack(*leaves: Any) -> Any:
         same = all(np.array_equal(leaf, leaves[0]) for leaf in leaves[1:])
