@@ -47,7 +47,7 @@ def run_batch(
 
     Args:
       store: of results.
-      configs: of the robots, with one ``cases.batch_spec`` and one duration.
+      configs: of the robots, with one ``sim.resolve.batch_spec`` and one duration.
       torques: ``"every_step"``, as on the robot, or ``"held"`` over a control tick.
       chunk: robots of one batch, which are kept together.
       threads: of the engine; one per core if ``None``.

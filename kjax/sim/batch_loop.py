@@ -24,19 +24,19 @@ import numpy as np
 
 from kjax.config import RunConfig
 from kjax.params import Tables
-from kjax.sim.cases import (
-    BatchSpec,
-    Case,
-    batch_spec,
-    check_engine,
-    push_at,
-    stack_cases,
-    stack_tables,
-)
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import find_addresses
 from kjax.sim.push import pushed_body
 from kjax.sim.recording import Recording, empty_log
+from kjax.sim.resolve import (
+    BatchSpec,
+    EpisodeParams,
+    batch_spec,
+    check_engine,
+    push_at,
+    stack_episodes,
+    stack_tables,
+)
 from kjax.sim.scene import build_model, dress
 from kjax.sim.walk import Sensed, TickLog, WalkState, build_walk
 
@@ -51,8 +51,8 @@ class Calls(NamedTuple):
     """Jitted functions of a group, batched over its robots.
 
     Attributes:
-      init: (tables, case, sensed) -> state.
-      first: (tables, case, state, step, sensed) -> (state, torque, log); plan and act.
+      init: (tables, episode, sensed) -> state.
+      first: (tables, episode, state, step, sensed) -> (state, torque, log); plan and act.
       then: the same without plan -> (state, torque).
     """
 
@@ -62,7 +62,7 @@ class Calls(NamedTuple):
 
 
 class BatchEngine:
-    """C MuJoCo for batches of configs with one ``cases.batch_spec``.
+    """C MuJoCo for batches of configs with one ``sim.resolve.batch_spec``.
 
     Compiles once per number of robots and kind of difference between them.
 
@@ -115,7 +115,7 @@ class BatchEngine:
         size = -(-len(configs) // threads)
         filled = [*configs, *[configs[-1]] * (threads * size - len(configs))]
         tables, axes = stack_tables(filled, self.dtype)
-        case = stack_cases(filled)
+        episode = stack_episodes(filled)
         calls = self._compiled(axes)
         stop, groups = Event(), []
         for first in range(0, len(filled), size):
@@ -129,7 +129,7 @@ class BatchEngine:
                     self.dtype,
                     stop,
                     tables=_rows(tables, axes, own),
-                    case=jax.tree.map(lambda a, s=own: a[s], case),
+                    episode=jax.tree.map(lambda a, s=own: a[s], episode),
                 )
             )
         groups[0].warm_up()  # compile in one thread
@@ -164,9 +164,9 @@ class BatchEngine:
         if key not in self._calls:
             walk = self._walk
 
-            def both(tables: Any, case: Any, state: Any, step: Any, sensed: Any) -> Any:
-                state, log = walk.plan(tables, case, state, step, sensed)
-                state, torque = walk.act(tables, case, state, step, sensed)
+            def both(tables: Any, episode: Any, state: Any, step: Any, sensed: Any) -> Any:
+                state, log = walk.plan(tables, episode, state, step, sensed)
+                state, torque = walk.act(tables, episode, state, step, sensed)
                 return state, torque, log
 
             self._calls[key] = Calls(
@@ -191,11 +191,11 @@ class _Group:
         stop: Event,
         *,
         tables: Tables,
-        case: Case,
+        episode: EpisodeParams,
     ):
         config, count = configs[0], len(configs)
         self._calls, self._stop, self._dtype = calls, stop, dtype
-        self._tables, self._case = tables, case
+        self._tables, self._episode = tables, episode
         self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
         per_act = round(config.leg.act_dt / config.sim.sim_dt)
         # Physics steps that share a torque.
@@ -214,10 +214,10 @@ class _Group:
             self._qpos[i], self._qvel[i] = initial_state(one, model.nq, model.nv)
         self._batch.forward()
         self._legs = find_addresses(model).actuator.reshape(-1)
-        self._pushed = bool((case.push_steps > 0).any())
+        self._pushed = bool((episode.push_steps > 0).any())
         # Torques on their way to the joints, a ring of as many as the longest delay.
-        self._ring = np.zeros((1 + int(case.delay.max()) // self._unit, count, model.nu))
-        self._delay = case.delay // self._unit
+        self._ring = np.zeros((1 + int(episode.delay.max()) // self._unit, count, model.nu))
+        self._delay = episode.delay // self._unit
         self.fell_at = np.full(count, self.ticks)
         self.fell = np.zeros(count, bool)
         self._state: Any = None
@@ -235,16 +235,16 @@ class _Group:
     def warm_up(self) -> None:
         """Compile by calling, results dropped."""
         sensed, step = self.sensed(), np.int32(0)
-        state = self._calls.init(self._tables, self._case, sensed)
-        state, *rest = self._calls.first(self._tables, self._case, state, step, sensed)
+        state = self._calls.init(self._tables, self._episode, sensed)
+        state, *rest = self._calls.first(self._tables, self._episode, state, step, sensed)
         if self._unit < self._per_tick:
-            state, *rest = self._calls.then(self._tables, self._case, state, step, sensed)
+            state, *rest = self._calls.then(self._tables, self._episode, state, step, sensed)
         jax.block_until_ready((state, rest))
 
     def walk(self) -> None:
         """All ticks, until told to stop."""
-        tables, case = self._tables, self._case
-        state = self._calls.init(tables, case, self.sensed())
+        tables, episode = self._tables, self._episode
+        state = self._calls.init(tables, episode, self.sensed())
         alive = np.ones(len(self.fell), bool)
         ids: np.ndarray | None = None  # all
         series: tuple[np.ndarray, ...] = ()
@@ -252,7 +252,7 @@ class _Group:
             if self._stop.is_set() or not alive.any():
                 break
             step, sensed = tick * self._per_tick, self.sensed()
-            state, torque, log = self._calls.first(tables, case, state, np.int32(step), sensed)
+            state, torque, log = self._calls.first(tables, episode, state, np.int32(step), sensed)
             host = TickLog(*map(np.asarray, log))
             torque = np.asarray(torque)
             if not series:
@@ -272,7 +272,7 @@ class _Group:
             for i in range(0, self._per_tick, self._unit):
                 if i > 0:
                     state, torque = self._calls.then(
-                        tables, case, state, np.int32(step + i), self.sensed()
+                        tables, episode, state, np.int32(step + i), self.sensed()
                     )
                     torque = np.asarray(torque)
                 self._apply(torque, step + i)
@@ -289,7 +289,7 @@ class _Group:
             torque = self._ring[when, np.arange(len(torque))]
         self._ctrl[:] = torque
         if self._pushed:
-            self._pushes[:] = push_at(self._case, step, self._unit)
+            self._pushes[:] = push_at(self._episode, step, self._unit)
 
     def _advance(self, ids: np.ndarray | None, alive: np.ndarray) -> None:
         """Physics of the robots that are alive."""
@@ -360,7 +360,7 @@ def require_one_batch(spec: BatchSpec, configs: Sequence[RunConfig], torques: st
         raise ValueError("configs must hold at least one config, got none")
     for i, config in enumerate(configs):
         if batch_spec(config) != spec:
-            raise ValueError(f"configs[{i}] belongs to another batch (see cases.batch_spec)")
+            raise ValueError(f"configs[{i}] belongs to another batch (see sim.resolve.batch_spec)")
         if config.duration != configs[0].duration:
             raise ValueError(
                 f"configs[{i}].duration is {config.duration} s, the first one's "

@@ -25,19 +25,19 @@ from kjax.sim.batch_loop import (
     require_one_batch,
     ticks_of,
 )
-from kjax.sim.cases import (
-    Case,
-    batch_spec,
-    check_engine,
-    push_at,
-    stack_cases,
-    stack_tables,
-)
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses
 from kjax.sim.push import pushed_body
 from kjax.sim.recording import Recording
+from kjax.sim.resolve import (
+    EpisodeParams,
+    batch_spec,
+    check_engine,
+    push_at,
+    stack_episodes,
+    stack_tables,
+)
 from kjax.sim.scene import build_spec
 from kjax.sim.walk import Sensed, TickLog, WalkState, build_walk
 
@@ -73,7 +73,7 @@ def build_model(config: RunConfig) -> mujoco.MjModel:
 
 
 class MjxEngine:
-    """MJX for batches of configs with one ``cases.batch_spec``; the same calls as ``BatchEngine``.
+    """MJX for batches of configs with one ``batch_spec``; the same calls as ``BatchEngine``.
 
     Compiles once per number of robots and kind of difference between them. A batch whose number of
     robots is a multiple of the number of local devices is sharded over them.
@@ -128,22 +128,22 @@ class MjxEngine:
         require_one_batch(self.spec, configs, self.torques)
         tables, axes = stack_tables(configs, self.dtype)
         models = dressed(self.model, configs)
-        case, (own, own_axes) = stack_cases(configs), self._differences(models)
+        episode, (own, own_axes) = stack_episodes(configs), self._differences(models)
         sensed, warm = self._start(configs, models)
-        delays = 1 + int(case.delay.max()) // self._unit
+        delays = 1 + int(episode.delay.max()) // self._unit
         ticks = ticks_of(configs[0])
         begin_call, walk_call = self._compiled(axes, own_axes, delays)
         place = _sharding(len(configs))
         if place:
-            case, sensed, warm, own = jax.device_put((case, sensed, warm, own), place)
+            episode, sensed, warm, own = jax.device_put((episode, sensed, warm, own), place)
             tables = _spread(tables, axes, place)
         begin, pieces, interrupted = time.perf_counter(), [], False
-        state = begin_call(tables, case, sensed, warm)
+        state = begin_call(tables, episode, sensed, warm)
         try:
             for done in range(0, ticks, _PIECE):
                 count = min(_PIECE, ticks - done)
                 # The last piece may be shorter than it is computed: one program for all.
-                state, piece = walk_call(tables, own, case, state)
+                state, piece = walk_call(tables, own, episode, state)
                 pieces.append(jax.device_get(jax.tree.map(lambda a, n=count: a[:n], piece)))
                 if on_progress is not None:
                     on_progress((done + count) * len(configs), ticks * len(configs))
@@ -211,12 +211,12 @@ class MjxEngine:
         key = (tuple(leaves), tree, tuple(own_axes), delays)
         if key not in self._calls:
 
-            def begin(tables: Any, case: Case, sensed: Sensed, warm: Array) -> MjxState:
-                return self._begin(tables, case, sensed, warm, delays)
+            def begin(tables: Any, episode: EpisodeParams, sensed: Sensed, warm: Array) -> MjxState:
+                return self._begin(tables, episode, sensed, warm, delays)
 
-            def piece(tables: Any, own: Any, case: Case, state: MjxState) -> Any:
+            def piece(tables: Any, own: Any, episode: EpisodeParams, state: MjxState) -> Any:
                 self.traces += 1
-                return self._walk_piece(tables, own, case, state)
+                return self._walk_piece(tables, own, episode, state)
 
             self._calls[key] = (
                 jax.jit(jax.vmap(begin, (axes, 0, 0, 0))),
@@ -225,7 +225,7 @@ class MjxEngine:
         return self._calls[key]
 
     def _begin(
-        self, tables: Tables, case: Case, sensed: Sensed, warm: Array, delays: int
+        self, tables: Tables, episode: EpisodeParams, sensed: Sensed, warm: Array, delays: int
     ) -> MjxState:
         data = self._cast(mjx.make_data(self._mjx, **_impl_argument(self._impl)))
         # Through .at[], since a replaced host array has another layout and compiles twice.
@@ -237,19 +237,19 @@ class MjxEngine:
         )
         return MjxState(
             data=data,
-            walk=self._walk.init(tables, case, _sensed(data)),
+            walk=self._walk.init(tables, episode, _sensed(data)),
             under_way=jnp.zeros((delays, self.model.nu), self.dtype),
             step=jnp.zeros((), jnp.int32),
         )
 
     def _walk_piece(
-        self, tables: Tables, own: dict[str, Array], case: Case, state: MjxState
+        self, tables: Tables, own: dict[str, Array], episode: EpisodeParams, state: MjxState
     ) -> tuple[MjxState, MjxTick]:
         model, walk, unit = self._mjx.replace(**own), self._walk, self._unit
         trunk = pushed_body(self.model)
 
         def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
-            push = push_at(case, step, xp=jnp).astype(self.dtype)
+            push = push_at(episode, step, xp=jnp).astype(self.dtype)
             pushes = jnp.zeros_like(data.xfrc_applied).at[trunk, :3].set(push)
             moved = mjx.step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
             # A robot that has fallen stays as it is, whatever its numbers have become.
@@ -262,11 +262,11 @@ class MjxEngine:
             if count == 1:
                 return under_way, torque
             under_way = under_way.at[place % count].set(torque)
-            return under_way, under_way[(place - case.delay // unit) % count]
+            return under_way, under_way[(place - episode.delay // unit) % count]
 
         def act(carry: MjxState, _: None) -> tuple[MjxState, Array]:
             data, robot, under_way, at = carry
-            robot, torque = walk.act(tables, case, robot, at, _sensed(data))
+            robot, torque = walk.act(tables, episode, robot, at, _sensed(data))
             under_way, applied = delayed(under_way, torque, at // unit)
 
             def onward(data: Any, i: Array) -> tuple[Any, None]:
@@ -280,7 +280,7 @@ class MjxEngine:
 
         def tick(carry: MjxState, _: None) -> tuple[MjxState, MjxTick]:
             data, robot, under_way, at = carry
-            robot, log = walk.plan(tables, case, robot, at, _sensed(data))
+            robot, log = walk.plan(tables, episode, robot, at, _sensed(data))
             carry = MjxState(data, robot, under_way, at)
             after, torques = jax.lax.scan(act, carry, None, length=self._per_tick // unit)
             return after, MjxTick(data.qpos, data.qvel, torques[0], robot.alive, log)

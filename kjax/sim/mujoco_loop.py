@@ -20,7 +20,6 @@ from kjax.params import Tables, condense, with_params
 from kjax.resolve import controller_key, resolve
 from kjax.robots import go1
 from kjax.sim import free_base
-from kjax.sim.cases import batch_spec
 from kjax.sim.episode import (
     Trajectory,
     fallen,
@@ -32,6 +31,7 @@ from kjax.sim.episode import (
 from kjax.sim.excitation import force_deviation, force_noise, perturb
 from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, find_addresses, noise_dim
 from kjax.sim.push import push_force, pushed_body
+from kjax.sim.resolve import batch_spec
 from kjax.sim.scene import build_model, dress, foot_geoms
 from kjax.state import ControllerState
 from kjax.types import Command, Observation

@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float
 from kjax.controller import build_controller
 from kjax.legs.base import build_base
 from kjax.params import Tables
-from kjax.sim.cases import BatchSpec, Case
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
 from kjax.sim.excitation import force_row, perturb
 from kjax.sim.observe import add_noise, build_observe
+from kjax.sim.resolve import BatchSpec, EpisodeParams
 from kjax.state import ControllerState
 from kjax.types import Observation
 
@@ -73,14 +73,14 @@ class Walk(NamedTuple):
     """Functions of one robot.
 
     Attributes:
-      init: (tables, case, sensed) -> state.
-      plan: (tables, case, state, step, sensed) -> (state, log); at the control rate.
-      act: (tables, case, state, step, sensed) -> (state, torque (12,) in actuator order).
+      init: (tables, episode, sensed) -> state.
+      plan: (tables, episode, state, step, sensed) -> (state, log); at the control rate.
+      act: (tables, episode, state, step, sensed) -> (state, torque (12,) in actuator order).
     """
 
-    init: Callable[[Tables, Case, Sensed], WalkState]
-    plan: Callable[[Tables, Case, WalkState, Array, Sensed], tuple[WalkState, TickLog]]
-    act: Callable[[Tables, Case, WalkState, Array, Sensed], tuple[WalkState, Array]]
+    init: Callable[[Tables, EpisodeParams, Sensed], WalkState]
+    plan: Callable[[Tables, EpisodeParams, WalkState, Array, Sensed], tuple[WalkState, TickLog]]
+    act: Callable[[Tables, EpisodeParams, WalkState, Array, Sensed], tuple[WalkState, Array]]
 
 
 def build_walk(
@@ -107,16 +107,16 @@ def build_walk(
             jnp.asarray(sensed.qpos), jnp.asarray(sensed.qvel), jnp.asarray(sensed.sensordata)
         )
 
-    def sense(case: Case, step: Array, sensed: Sensed) -> Observation:
+    def sense(episode: EpisodeParams, step: Array, sensed: Sensed) -> Observation:
         if not scene.noise:
             return see(sensed)
-        row = noise_row(case.seed, step, scene.base).astype(sensed.qpos.dtype)
-        seen = add_noise(see(sensed), row * case.noise_scale.astype(row.dtype))
+        row = noise_row(episode.seed, step, scene.base).astype(sensed.qpos.dtype)
+        seen = add_noise(see(sensed), row * episode.noise_scale.astype(row.dtype))
         # Else XLA draws the numbers again for each of their uses.
         return jax.lax.optimization_barrier(seen)
 
-    def init(tables: Tables, case: Case, sensed: Sensed) -> WalkState:
-        first = sense(case, jnp.zeros((), jnp.int32), sensed)
+    def init(tables: Tables, episode: EpisodeParams, sensed: Sensed) -> WalkState:
+        first = sense(episode, jnp.zeros((), jnp.int32), sensed)
         return WalkState(
             controller=controller.init(tables, first),
             track=base.track(see(sensed)),
@@ -124,14 +124,14 @@ def build_walk(
         )
 
     def plan(
-        tables: Tables, case: Case, state: WalkState, step: Array, sensed: Sensed
+        tables: Tables, episode: EpisodeParams, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, TickLog]:
-        moved, info = controller.plan(tables, state.controller, sense(case, step, sensed))
+        moved, info = controller.plan(tables, state.controller, sense(episode, step, sensed))
         if scene.force_noise:
-            added = case.force_noise * force_row(case.seed, step)
+            added = episode.force_noise * force_row(episode.seed, step)
             moved = moved._replace(force=perturb(moved.force, moved.stance, added))
         true = see(sensed)
-        true = true._replace(base_pos=true.base_pos - case.origin.astype(true.base_pos.dtype))
+        true = true._replace(base_pos=true.base_pos - episode.origin.astype(true.base_pos.dtype))
         body = base.view(tables.params.robot, state.track, true).planar
         log = TickLog(
             x=body.x,
@@ -149,9 +149,9 @@ def build_walk(
         return WalkState(moved, state.track, state.alive & standing(body.x, true)), log
 
     def act(
-        tables: Tables, case: Case, state: WalkState, step: Array, sensed: Sensed
+        tables: Tables, episode: EpisodeParams, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, Array]:
-        moved, torque = controller.act(tables, state.controller, sense(case, step, sensed))
+        moved, torque = controller.act(tables, state.controller, sense(episode, step, sensed))
         torque = jnp.where(state.alive, torque, 0.0)
         return state._replace(controller=moved), torque.reshape(-1)[order]
 

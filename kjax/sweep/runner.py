@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dict
 from kjax.episodes import code_version, config_hash
-from kjax.sim.cases import BatchSpec, batch_spec, check_engine
+from kjax.sim.resolve import BatchSpec, batch_spec, check_engine
 from kjax.sweep.grid import plan
 from kjax.sweep.store import Store, columns, lock, restart
 

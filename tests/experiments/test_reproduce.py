@@ -9,7 +9,7 @@ from argparse import Namespace
 import pytest
 
 from kjax.gait import bound
-from kjax.sim.cases import batch_spec
+from kjax.sim.resolve import batch_spec
 
 
 @pytest.fixture(scope="module")

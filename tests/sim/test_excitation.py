@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, load_config
-from kjax.sim import cases
 from kjax.sim.batch_loop import BatchEngine
 from kjax.sim.excitation import force_noise, force_row, perturb
 from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
+from kjax.sim.resolve import batch_spec
 
 SHORT = {
     "sim.base": "planar",
@@ -49,11 +49,11 @@ def test_noise_depends_on_the_seed_and_the_tick_and_has_the_size_asked_for():
 def test_only_whether_forces_are_perturbed_is_compiled_in():
     off = {"noise.force": 0.0}
     none = {"noise.enabled": False}
-    for part in (cases.batch_spec, simulation_key):
+    for part in (batch_spec, simulation_key):
         assert part(config()) == part(config(**{"noise.force": 3.0}))
         assert part(config()) != part(config(**off))
     assert simulation_key(config(**none)) == simulation_key(config(**off))
-    assert cases.batch_spec(config(**none)) == cases.batch_spec(config(**off, **none))
+    assert batch_spec(config(**none)) == batch_spec(config(**off, **none))
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A batch of configs as data: what is compiled once, and what differs between its robots.
+"""From a config to the world that a robot walks in: its spec (static) and its parameters (data).
 
 Two configs may share a compiled batch if their ``batch_spec`` is the same: what is not in there
 (weights, bounds, timing, terrain, command, pushes, noise, friction, ...) travels as arrays with a
@@ -28,8 +28,8 @@ from kjax.spec import ControllerSpec
 from kjax.types import Command
 
 
-class Case(NamedTuple):
-    """What one robot of a batch meets, besides its controller and its scene.
+class EpisodeParams(NamedTuple):
+    """What a robot meets in an episode; a leading axis (B) makes a batch of them.
 
     Attributes:
       seed: of the noise.
@@ -91,16 +91,17 @@ class BatchSpec:
     scene: SceneSpec
 
 
-def batch_spec(config: RunConfig) -> BatchSpec:
-    """Spec of a config: those with an equal one may walk in one compiled batch."""
-    # What a file holds may have changed since.
-    return _batch_spec.__wrapped__(config) if config.koopman.file else _batch_spec(config)
+def resolve_scene(
+    config: RunConfig, *, pushes: int | None = None
+) -> tuple[SceneSpec, EpisodeParams]:
+    """Spec and parameters of the world that a robot walks in.
 
-
-@lru_cache(maxsize=8192)
-def _batch_spec(config: RunConfig) -> BatchSpec:
-    sim, terrain, noise = config.sim, config.terrain, config.noise
-    scene = SceneSpec(
+    Args:
+      config: of the run.
+      pushes: length of the list of pushes, filled up with none; as many as there are if ``None``.
+    """
+    sim, terrain, noise, push = config.sim, config.terrain, config.noise, config.push
+    spec = SceneSpec(
         base=sim.base,
         sim_dt=sim.sim_dt,
         cone=sim.cone,
@@ -113,42 +114,53 @@ def _batch_spec(config: RunConfig) -> BatchSpec:
         noise=noise.enabled,
         force_noise=force_deviation(noise) > 0,
     )
-    return BatchSpec(controller=controller_spec(config), scene=scene)
+    steps = round(push.duration / sim.sim_dt)
+    count = len(push.times) if pushes is None else pushes
+    force, begin, length = (
+        np.zeros((count, 3)),
+        np.zeros(count, np.int32),
+        np.zeros(count, np.int32),
+    )
+    for row, forward, lateral in zip(force, *impulses(push), strict=False):
+        row[:2] = np.array([forward, lateral]) / (steps * sim.sim_dt)
+    begin[: len(push.times)] = [round(time / sim.sim_dt) for time in push.times]
+    length[: len(push.times)] = steps
+    return spec, EpisodeParams(
+        seed=np.int32(config.seed),
+        noise_scale=noise_scale(noise, sim.base).astype(np.float32),
+        force_noise=np.float32(force_deviation(noise)),
+        push_begin=begin,
+        push_steps=length,
+        push_force=force,
+        delay=np.int32(round(sim.delay / sim.sim_dt)),
+        origin=origin(sim),
+    )
 
 
-def stack_cases(configs: Sequence[RunConfig]) -> Case:
-    """Cases (B, ...) of configs; shorter lists of pushes are filled up with none."""
+def batch_spec(config: RunConfig) -> BatchSpec:
+    """Spec of a config: those with an equal one may walk in one compiled batch."""
+    # What a file holds may have changed since.
+    return _batch_spec.__wrapped__(config) if config.koopman.file else _batch_spec(config)
+
+
+@lru_cache(maxsize=8192)
+def _batch_spec(config: RunConfig) -> BatchSpec:
+    return BatchSpec(controller=controller_spec(config), scene=resolve_scene(config)[0])
+
+
+def stack_episodes(configs: Sequence[RunConfig]) -> EpisodeParams:
+    """Parameters (B, ...) of the episodes; shorter lists of pushes are filled up with none."""
     count = max(len(config.push.times) for config in configs)
-
-    def one(config: RunConfig) -> Case:
-        dt, push = config.sim.sim_dt, config.push
-        steps = round(push.duration / dt)
-        rows = np.zeros((count, 3))
-        for row, forward, lateral in zip(rows, *impulses(push), strict=False):
-            row[:2] = np.array([forward, lateral]) / (steps * dt)
-        begin, length = np.zeros(count, np.int32), np.zeros(count, np.int32)
-        begin[: len(push.times)] = [round(time / dt) for time in push.times]
-        length[: len(push.times)] = steps
-        return Case(
-            seed=np.int32(config.seed),
-            noise_scale=noise_scale(config.noise, config.sim.base).astype(np.float32),
-            force_noise=np.float32(force_deviation(config.noise)),
-            push_begin=begin,
-            push_steps=length,
-            push_force=rows,
-            delay=np.int32(round(config.sim.delay / dt)),
-            origin=origin(config.sim),
-        )
-
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *map(one, configs))
+    episodes = [resolve_scene(config, pushes=count)[1] for config in configs]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *episodes)
 
 
-def push_at(case: Case, step: Any, count: int = 1, xp: Any = np) -> Any:
+def push_at(episode: EpisodeParams, step: Any, count: int = 1, xp: Any = np) -> Any:
     """Mean force (..., 3) on the trunk over ``count`` physics steps from ``step`` on [N]."""
-    first = xp.maximum(case.push_begin, step)
-    last = xp.minimum(case.push_begin + case.push_steps, step + count)
+    first = xp.maximum(episode.push_begin, step)
+    last = xp.minimum(episode.push_begin + episode.push_steps, step + count)
     part = xp.maximum(last - first, 0) / count
-    return (part[..., None] * case.push_force).sum(axis=-2)
+    return (part[..., None] * episode.push_force).sum(axis=-2)
 
 
 def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]:

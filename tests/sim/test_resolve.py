@@ -10,7 +10,7 @@ from kjax.config import ConfigError, RunConfig, fields, load_config
 from kjax.params import condense
 from kjax.resolve import resolve
 from kjax.robots import go1
-from kjax.sim import cases
+from kjax.sim import resolve as scene
 from kjax.sim.observe import find_addresses
 from kjax.sim.push import push_force
 from kjax.sim.scene import build_model
@@ -76,25 +76,25 @@ def keys():
 def program(config):
     """What ``plan`` and ``act`` compute, as text."""
     model = build_model(config.sim, visual=False)
-    spec = cases.batch_spec(config)
+    spec = scene.batch_spec(config)
     walk = build_walk(spec, model, find_addresses(model).actuator, held=False)
     tables = condense(*resolve(config, go1.PARAMS))
-    case = jax.tree.map(lambda leaf: leaf[0], cases.stack_cases([config]))
+    episode = jax.tree.map(lambda leaf: leaf[0], scene.stack_episodes([config]))
     sensed = Sensed(np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nsensordata))
-    state = jax.eval_shape(walk.init, tables, case, sensed)
+    state = jax.eval_shape(walk.init, tables, episode, sensed)
     step = np.int32(0)
-    plan = jax.make_jaxpr(walk.plan)(tables, case, state, step, sensed)
-    act = jax.make_jaxpr(walk.act)(tables, case, state, step, sensed)
+    plan = jax.make_jaxpr(walk.plan)(tables, episode, state, step, sensed)
+    act = jax.make_jaxpr(walk.act)(tables, episode, state, step, sensed)
     return str(plan), str(act)
 
 
 def test_every_key_either_makes_another_program_or_none():
     """A new key of the config belongs to the spec, or must not reach the compiled functions."""
-    plain = cases.batch_spec(RunConfig())
+    plain = scene.batch_spec(RunConfig())
     changing = {
         name
         for name, value in keys()
-        if cases.batch_spec(load_config(RunConfig, None, {name: value})) != plain
+        if scene.batch_spec(load_config(RunConfig, None, {name: value})) != plain
     }
     assert changing == STATIC
 
@@ -104,19 +104,19 @@ def test_what_a_batch_may_vary_changes_nothing_in_the_program(base):
     own = {"sim.base": base}
     varied = own | {name: value for name, value in keys() if name not in STATIC}
     config, other = (load_config(RunConfig, None, chosen) for chosen in (own, varied))
-    assert cases.batch_spec(other) == cases.batch_spec(config)
-    assert hash(cases.batch_spec(other)) == hash(cases.batch_spec(config))
+    assert scene.batch_spec(other) == scene.batch_spec(config)
+    assert hash(scene.batch_spec(other)) == hash(scene.batch_spec(config))
     assert program(other) == program(config)
 
 
 def test_nodes_of_a_cycle_make_another_program():
     cycle = {"gait.names": ["bound"], "bound.horizon": "multiphase"}
     specs = [
-        cases.batch_spec(load_config(RunConfig, None, cycle | own))
+        scene.batch_spec(load_config(RunConfig, None, cycle | own))
         for own in ({}, {"multiphase.node_dt": 0.025}, {"multiphase.tolerance": 1e-7})
     ]
     assert len(set(specs)) == 3
-    assert specs[0] == cases.batch_spec(
+    assert specs[0] == scene.batch_spec(
         load_config(RunConfig, None, cycle | {"multiphase.friction": 0.5, "bound.height": 0.28})
     )
 
@@ -126,12 +126,12 @@ def test_pushes_are_those_of_a_single_run():
         load_config(RunConfig, None, {"push.times": times, "push.forward": 3.0})
         for times in ([0.01], [0.02, 0.05], [])
     ]
-    stacked = cases.stack_cases(configs)
+    stacked = scene.stack_episodes(configs)
     for step in range(300):
         wanted = [push_force(c.push, np.array(step * 1e-3), 1e-3, np) for c in configs]
-        np.testing.assert_allclose(cases.push_at(stacked, step), wanted, atol=1e-12)
+        np.testing.assert_allclose(scene.push_at(stacked, step), wanted, atol=1e-12)
     # over a control tick: the mean, so that the impulse stays
-    held = sum(cases.push_at(stacked, step, 5) * 5e-3 for step in range(0, 300, 5))
+    held = sum(scene.push_at(stacked, step, 5) * 5e-3 for step in range(0, 300, 5))
     np.testing.assert_allclose(held[:, 0], [3.0, 6.0, 0.0], rtol=1e-12)
 
 
@@ -144,7 +144,7 @@ def test_parameters_of_a_batch_are_those_of_its_robots():
             {"gait.names": ["trot", "bound"], "gait.times": [0.0, 2.0]},
         )
     ]
-    tables, axes = cases.stack_tables(configs, np.float64)
+    tables, axes = scene.stack_tables(configs, np.float64)
     assert axes.params.height == 0
     assert axes.params.swing.kp is None  # alike for all, so held once
     for i, config in enumerate(configs):
