@@ -10,6 +10,7 @@ from kjax.config import RunConfig, load_config
 from kjax.sim.batch_loop import BatchEngine, dressed
 from kjax.sim.episode import initial_state, metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
+from kjax.sim.observe import find_addresses
 
 pytestmark = pytest.mark.slow
 
