@@ -344,8 +344,8 @@ def test_only_a_bound_has_a_periodic_reference_and_only_if_it_is_asked_for(bound
     for name, rows in zip(names, reference, strict=True):
         assert rows.any() == (name == "bound")
     constant = condense(*resolve(bounding(**{"bound.reference": "constant"}), go1.PARAMS))
-    assert constant.reference.shape == reference.shape
-    np.testing.assert_array_equal(constant.reference, 0.0)
+    assert constant.params.reference.shape == reference.shape
+    np.testing.assert_array_equal(constant.params.reference, 0.0)
 
 
 def test_a_constant_reference_is_level_and_at_rest_in_every_phase(controller, plan):
