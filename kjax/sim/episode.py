@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from kjax import qp
 from kjax.config import (
@@ -97,6 +97,15 @@ class Trajectory:
         ):
             values[name] = kind(values[name])
         return cls(**values)
+
+
+def reference_height(gait: Int[np.ndarray, "N"], config: RunConfig) -> Float[np.ndarray, "N"]:
+    """Reference height of the centre of mass above the ground in each gait [m]."""
+    heights = [
+        config.bound.height if one.name == "bound" else config.lmpc.height
+        for one in build_gaits(config)
+    ]
+    return np.array(heights)[gait]
 
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
@@ -294,8 +303,7 @@ def _tracking(run: Trajectory, config: RunConfig) -> dict[str, Any]:
             "velocity_late_rmse_mps": float(np.sqrt(np.mean(error**2))),
         }
     if config.terrain.kind == "flat":
-        bounding = run.gait[steady] == [g.name for g in build_gaits(config)].index("bound")
-        error = run.x[steady, 1] - np.where(bounding, config.bound.height, config.lmpc.height)
+        error = run.x[steady, 1] - reference_height(run.gait[steady], config)
         result |= {
             "height_error_max_m": float(np.abs(error).max()),
             "height_error_mean_m": float(abs(error.mean())),

@@ -13,9 +13,10 @@ from matplotlib.axes import Axes
 from kjax.config import RunConfig
 from kjax.robots.go1 import JOINTS
 from kjax.sim import free_base
-from kjax.sim.episode import Trajectory
+from kjax.sim.episode import Trajectory, reference_height
 from kjax.sim.series import Series
 from kjax.types import Leg
+from kjax.walkable import build_gaits
 
 BLUE, RED, GREY, DARK = "#2b6cb0", "#c53030", "#a0aec0", "#2d3748"
 _LEG_COLOURS = ("#c53030", "#2b6cb0", "#dd6b20", "#2f855a")
@@ -46,7 +47,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         )
         t = run.time
         velocity, pitch, height, force, torque, bars = axes
-        window = max(1, round(2 * config.gait.stance_time / config.sim.sim_dt))
+        window = max(1, round(stride_time(run.gait, config) / config.sim.sim_dt))
         velocity.plot(t, run.x[:, 3], color=GREY, lw=0.6, label="centre of mass")
         velocity.plot(t, moving_mean(run.x[:, 3], window), color=BLUE, label="mean over a stride")
         velocity.plot(t, run.velocity_command, "--", color=DARK, lw=1.1, label="command")
@@ -65,7 +66,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
             pitch.legend(ncol=3, loc="upper left")
 
         height.plot(t, run.x[:, 1], color=BLUE)
-        height.axhline(config.lmpc.height, ls="--", color=DARK, lw=0.9)
+        height.plot(t, reference_height(run.gait, config), ls="--", color=DARK, lw=0.9)
         height.set_ylabel("CoM height [m]")
 
         for axis in (velocity, pitch, height):
@@ -89,6 +90,12 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         fig.tight_layout(h_pad=0.3)
         fig.savefig(path, dpi=140)
         plt.close(fig)
+
+
+def stride_time(gait: np.ndarray, config: RunConfig) -> float:
+    """Duration of a cycle of the gait that most of a run is in, flights at full length [s]."""
+    most = build_gaits(config)[np.bincount(gait).argmax()]
+    return sum(phase.duration for phase in most.phases)
 
 
 def zoom_window(end: float, config: RunConfig) -> tuple[float, float]:

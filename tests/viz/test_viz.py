@@ -1,3 +1,5 @@
+import dataclasses
+
 import imageio.v2 as imageio
 import numpy as np
 import pytest
@@ -29,6 +31,28 @@ def test_the_figure_has_ink(saved):
     picture = imageio.imread(folder / "figure.png")
     assert picture.shape[0] > 500
     assert picture[..., :3].std() > 10
+
+
+def test_the_figure_knows_the_height_and_the_stride_of_the_gait_that_is_walked(
+    saved, tmp_path, monkeypatch
+):
+    """A bound's own height, and its cycle of 0.1 + 0.1 + 0.05 + 0.1 s."""
+    _, run, _ = saved
+    drawn = {}
+    close = plots.plt.close
+
+    def look(fig):
+        drawn["height"] = fig.axes[2].lines[1].get_ydata()
+        close(fig)
+
+    monkeypatch.setattr(plots.plt, "close", look)
+    bound = load_config(RunConfig, None, {"bound.height": 0.301})
+    half = np.arange(len(run.time)) >= len(run.time) // 2
+    switched = dataclasses.replace(run, gait=np.where(half, 1, 0))
+    plots.closed_loop_figure(switched, bound, tmp_path / "figure.png")
+    np.testing.assert_array_equal(drawn["height"], np.where(half, 0.301, 0.27))
+    assert plots.stride_time(switched.gait[half], bound) == pytest.approx(0.35)
+    assert plots.stride_time(switched.gait[~half], bound) == pytest.approx(0.5)
 
 
 def test_a_moving_mean_of_a_line_is_that_line():
