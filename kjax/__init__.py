@@ -18,6 +18,15 @@ from kjax.types import Leg, Mode, Observation
 
 __version__ = "0.1.0"
 
+_MOVED = {"build_params": "resolve(config, robot), then condense(spec, params)"}
+
+
+def __getattr__(name: str) -> object:
+    if name in _MOVED:
+        raise ImportError(f"kjax.{name} has gone: use {_MOVED[name]}")
+    raise AttributeError(f"module 'kjax' has no attribute '{name}'")
+
+
 __all__ = [
     "ConfigError",
     "ControlLoop",

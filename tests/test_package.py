@@ -6,6 +6,8 @@ import zipfile
 
 import pytest
 
+import kjax
+
 
 @pytest.mark.slow
 def test_the_wheel_holds_every_subpackage_and_the_mjcf(repository, tmp_path):
@@ -23,3 +25,9 @@ def test_the_wheel_holds_every_subpackage_and_the_mjcf(repository, tmp_path):
     }
     assert sources <= inside
     assert "kjax/robots/go1.xml" in inside
+
+
+def test_a_public_name_that_has_gone_gives_the_new_one():
+    with pytest.raises(ImportError, match=r"kjax\.build_params has gone: use resolve\(config"):
+        from kjax import build_params  # noqa: F401
+    assert not hasattr(kjax, "nothing_of_that_name")
