@@ -28,7 +28,7 @@ class ControlLoop:
     """One robot's controller, called once per ``act_dt``.
 
     Attributes:
-      params: numbers of the controller; replace it at any time, e.g. for another command: what is
+      params: of the controller; replace them at any time, e.g. for another command: what is
         condensed from them is built again, in milliseconds.
       state: of the controller; ``None`` before the first call.
       info: of the last plan; ``None`` before the first call.
@@ -50,7 +50,7 @@ class ControlLoop:
         self._dtype = jnp.zeros(()).dtype
         self._init = jax.jit(controller.init)
         self._plan, self._act = jax.jit(controller.plan), jax.jit(controller.act)
-        crouch = self._in_one_type(standing())
+        crouch = self._as_arrays(standing())
         # The look at the first sample compiles too; what it says of a made-up one is of no matter.
         with suppress(ValueError), warnings.catch_warnings(action="ignore"):
             check_observation(params.robot, crouch)
@@ -62,7 +62,7 @@ class ControlLoop:
 
     @property
     def params(self) -> ControllerParams:
-        """Numbers of the controller."""
+        """Parameters of the controller."""
         return self._params
 
     @params.setter
@@ -95,7 +95,7 @@ class ControlLoop:
                 f"time must run on from {self._last:g} s, got {time:g} s; after a restart of the "
                 "robot call reset()"
             )
-        observation = self._in_one_type(observation)
+        observation = self._as_arrays(observation)
         if self.state is None:
             check_observation(self.params.robot, observation)
             self.state = self._init(self._tables, observation)
@@ -111,7 +111,7 @@ class ControlLoop:
         self.state, torque = self._act(self._tables, self.state, observation)
         return np.asarray(torque)
 
-    def _in_one_type(self, observation: Observation) -> Observation:
+    def _as_arrays(self, observation: Observation) -> Observation:
         """The sample as arrays of one type, so that lists or float32 compile nothing again."""
         return jax.tree.map(
             lambda value: np.asarray(value, self._dtype),

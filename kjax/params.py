@@ -1,4 +1,4 @@
-"""All numbers of a controller, and what is built from them once, off line."""
+"""Parameters of a controller, and the tables that are condensed from them once, off line."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -36,13 +36,14 @@ class Fits(NamedTuple):
 
 
 class ControllerParams(NamedTuple):
-    """All numbers of a controller; data, so any leaf may be batched or replaced.
+    """All parameters of a controller; data, so any leaf may be batched or replaced.
 
     Attributes:
       robot: geometry and masses.
       fits: prediction models of every contact mode.
       modes: weights and bounds of the LMPC within a stance, of every contact mode.
-      caution: how much less its uncertain steps weigh; not read where the spec is not cautious [-].
+      uncertainty_discount: how much less its uncertain steps weigh; not read where the spec does
+        not discount [-].
       friction: mu of its friction rows; not read where the spec has none [-].
       torque_fraction: part of the joint torque limits in its torque rows; likewise [-].
       schedule: gaits.
@@ -66,7 +67,7 @@ class ControllerParams(NamedTuple):
     robot: RobotParams
     fits: Fits
     modes: ModeSettings
-    caution: Float[Array, ""]
+    uncertainty_discount: Float[Array, ""]
     friction: Float[Array, ""]
     torque_fraction: Float[Array, ""]
     schedule: gait.Schedule
@@ -86,11 +87,11 @@ class ControllerParams(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """What a controller's functions take: its numbers, and what is condensed from them.
+    """What a controller's functions take: its parameters, and what is condensed from them.
 
     Attributes:
-      params: numbers; command and requests of gaits may be replaced, what the LMPC's tables are
-        made of (fits, modes, caution) is condensed already.
+      params: parameters; those that the LMPC's tables are condensed from (fits, modes,
+        uncertainty_discount) are not read any more.
       lmpc: condensed problems within a stance, of every contact mode.
     """
 
@@ -99,14 +100,14 @@ class Tables(NamedTuple):
 
 
 def condense(spec: ControllerSpec, params: ControllerParams, *, dtype: Any = None) -> Tables:
-    """Everything that depends on the numbers alone, built once.
+    """Precompute what depends on the parameters alone.
 
     The work is done in float64 whatever the caller's default, and the result is cast once; inside
-    ``jit``, ``grad`` or ``vmap`` it is done in the floating type of the traced numbers.
+    ``jit``, ``grad`` or ``vmap`` it is done in the floating type of the traced parameters.
 
     Args:
       spec: of the controller.
-      params: its numbers, from ``kjax.resolve`` or changed since.
+      params: from ``kjax.resolve``, or changed since.
       dtype: floating type of the result; JAX's current default if ``None``.
     """
     if not isinstance(params, ControllerParams):
@@ -115,20 +116,20 @@ def condense(spec: ControllerSpec, params: ControllerParams, *, dtype: Any = Non
     if not is_concrete((params, jnp.zeros(()))):  # the latter is traced inside jit, whatever params
         return cast(Tables(params, _condensed(spec, params)), dtype)
     with jax.enable_x64(True):
-        tables = Tables(params, jax.device_get(_condensed(spec, jax.tree.map(_double, params))))
+        tables = Tables(params, jax.device_get(_condensed(spec, jax.tree.map(_as_float64, params))))
     return cast(tables, dtype)
 
 
 def with_params(tables: Tables, **changes: Any) -> Tables:
-    """Tables with other numbers that nothing is condensed from, e.g. ``command``.
+    """Tables with other parameters that nothing is condensed from, e.g. ``command``.
 
     Raises:
-      ValueError: for numbers that the LMPC's tables are made of: ``condense`` them again.
+      ValueError: for parameters that the LMPC's tables are condensed from.
     """
     params = tables.params
-    condensed = sorted({"fits", "modes", "caution"} & changes.keys())
+    condensed = sorted({"fits", "modes", "uncertainty_discount"} & changes.keys())
     if condensed:
-        raise ValueError(f"{', '.join(condensed)}: tables are made of it; use condense")
+        raise ValueError(f"{', '.join(condensed)}: the tables are condensed from it; use condense")
     # In the type that is there: else every function compiles again.
     changes = {
         name: jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), new, getattr(params, name))
@@ -146,18 +147,18 @@ def _condensed(spec: ControllerSpec, params: ControllerParams) -> LmpcTables:
         horizon=spec.horizon,
         feet=params.fits.feet,
         spread=params.fits.spread,
-        cautious=spec.cautious,
-        caution=params.caution,
+        discount=spec.discounts_uncertainty,
+        uncertainty_discount=params.uncertainty_discount,
     )
 
 
-def _double(leaf: Any) -> np.ndarray:
+def _as_float64(leaf: Any) -> np.ndarray:
     array = np.asarray(leaf)
     return array.astype(float) if np.issubdtype(array.dtype, np.floating) else array
 
 
 def cast(tree: Any, dtype: Any) -> Any:
-    """Numbers on the device, floats in ``dtype``, integers as int32."""
+    """Arrays on the device, floats in ``dtype``, integers as int32."""
     return jax.tree.map(lambda leaf: _as(leaf, dtype), tree)
 
 

@@ -29,7 +29,7 @@ from kjax.walkable import build_gaits, check_walkable, cycle_nodes
 
 
 def resolve(config: RunConfig, robot: RobotParams) -> tuple[ControllerSpec, ControllerParams]:
-    """Spec and parameters of a controller: fits the Koopman models and gathers a config's numbers.
+    """Spec and parameters of a controller; fits the Koopman models.
 
     A fit whose response to forces is far from the rigid body's along the LMPC's horizon is warned
     of.
@@ -39,7 +39,7 @@ def resolve(config: RunConfig, robot: RobotParams) -> tuple[ControllerSpec, Cont
       robot: e.g. ``kjax.robots.go1.PARAMS``.
 
     Returns:
-      What ``build_controller`` takes, and its numbers, NumPy arrays in float64: change or batch
+      What ``build_controller`` takes, and its parameters, NumPy arrays in float64: change or batch
       them, then ``condense`` both to what the controller's functions take.
 
     Raises:
@@ -70,7 +70,7 @@ def controller_spec(config: RunConfig) -> ControllerSpec:
         model_dt=lmpc.model_dt,
         horizon=lmpc.horizon,
         model=model_spec(config.koopman),
-        cautious=lmpc.caution > 0,
+        discounts_uncertainty=lmpc.caution > 0,
         friction_rows=lmpc.friction < inf,
         torque_rows=lmpc.torque_fraction < inf,
         solver=lmpc.solver,
@@ -171,7 +171,7 @@ def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
 
 
 def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> ControllerParams:
-    """Parameters from a config, or an ``Overlay`` with traced numbers, and its fits."""
+    """Parameters from a config, or an ``Overlay`` with traced values, and its fits."""
     gaits = build_gaits(config)
     names = [g.name for g in gaits]
     leg, bound, sideways = config.leg, config.bound, config.lateral
@@ -182,7 +182,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
         robot=robot,
         fits=fits,
         modes=mode_settings(config.lmpc, bound, mean_force(config, mass)),
-        caution=jnp.asarray(config.lmpc.caution, float),
+        uncertainty_discount=jnp.asarray(config.lmpc.caution, float),
         friction=jnp.asarray(config.lmpc.friction, float),
         torque_fraction=jnp.asarray(config.lmpc.torque_fraction, float),
         schedule=gait.build_schedule(gaits),

@@ -1,4 +1,4 @@
-"""What shapes a controller's compiled program; all else is numbers in ``ControllerParams``.
+"""What shapes a controller's compiled program; all else is data in ``ControllerParams``.
 
 Two controllers share a compilation exactly when their specs are equal. A spec is made by
 ``kjax.resolve``; it is hashable, so it may be a static argument or a key.
@@ -76,7 +76,7 @@ class ControllerSpec:
       model_dt: step of the prediction within a stance [s].
       horizon: its number of steps.
       model: that predicts within a stance.
-      cautious: whether uncertain steps weigh less.
+      discounts_uncertainty: whether uncertain steps of the horizon weigh less.
       friction_rows: whether friction limits forces, within a stance.
       torque_rows: whether joint torques do.
       solver: of the box QP: "tableau", "admm" or "projected_gradient".
@@ -93,7 +93,7 @@ class ControllerSpec:
     model_dt: float = 0.001
     horizon: int = 6
     model: ModelSpec = ModelSpec(dictionary=DictionarySpec())
-    cautious: bool = False
+    discounts_uncertainty: bool = False
     friction_rows: bool = True
     torque_rows: bool = True
     solver: Literal["tableau", "admm", "projected_gradient"] = "tableau"

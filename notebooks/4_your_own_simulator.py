@@ -71,7 +71,7 @@ def walk(tables, seconds):
 speed = walk(tables, 3.0)
 
 # %% [markdown]
-# ## Numbers are data
+# ## Parameters are data
 #
 # Another command: replace a leaf. Another weight: replace it, then `condense` again. Nothing
 # compiles again.

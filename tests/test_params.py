@@ -73,7 +73,7 @@ def test_numbers_that_are_condensed_already_are_not_replaced_in_tables(both):
         with_params(tables, height=np.full(3, 0.25)).params.height.dtype
         == tables.params.height.dtype
     )
-    with pytest.raises(ValueError, match=r"modes: tables are made of it; use condense"):
+    with pytest.raises(ValueError, match=r"modes: the tables are condensed from it; use condense"):
         with_params(tables, modes=params.modes)
 
 

@@ -23,10 +23,10 @@ TorqueFraction = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
 @dataclass(frozen=True, kw_only=True)
 class Tunable:
-    """That a number may be tuned by gradients, in which coordinate and range.
+    """That a parameter may be tuned by gradients, in which coordinate and range.
 
     Attributes:
-      unit: a change that matters, of numbers of either sign; ``None`` for the logarithm.
+      unit: a change that matters, of a parameter of either sign; ``None`` for its logarithm.
       low: least value.
       high: largest value.
     """
@@ -38,11 +38,11 @@ class Tunable:
 
 WEIGHT = Tunable(low=1e-12)
 FORCE = Tunable(low=1.0, high=1000.0)
-LEAST_FORCE = Tunable(unit=10.0, low=-100.0, high=100.0)
+MIN_FORCE = Tunable(unit=10.0, low=-100.0, high=100.0)
 HEIGHT = Tunable(low=0.15, high=0.33)
 GAIN = Tunable(unit=0.02, high=0.5)
 RATE = Tunable(unit=0.5, high=20.0)
-PLACE = Tunable(low=0.02, high=0.30)
+FOOT_DISTANCE = Tunable(low=0.02, high=0.30)
 TIME = Tunable(low=0.02, high=2.0)
 
 

@@ -7,11 +7,11 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from kjax.config.checks import (
+    FOOT_DISTANCE,
     FORCE,
     GAIN,
     HEIGHT,
-    LEAST_FORCE,
-    PLACE,
+    MIN_FORCE,
     RATE,
     STRICT,
     TIME,
@@ -65,7 +65,7 @@ class LmpcConfig:
     force (the paper), which leaves a droop [-]."""
     force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 60.0
     """Bound of |F_x| per leg, body frame [N]."""
-    force_z_min: Annotated[Bound, LEAST_FORCE] = 0.0
+    force_z_min: Annotated[Bound, MIN_FORCE] = 0.0
     """Lower bound of F_z per leg, body frame [N]."""
     force_z_max: Annotated[Bound, FORCE] = 160.0
     """Upper bound of F_z per leg, body frame [N]."""
@@ -148,9 +148,9 @@ class BoundConfig:
     """Length of the flights in the first cycle, as a fraction of the full one [-]."""
     ramp_cycles: Annotated[int, Field(ge=0)] = 10
     """Number of cycles over which the flights grow to their full length [-]."""
-    feet_front: Annotated[Positive, PLACE] = 0.075
+    feet_front: Annotated[Positive, FOOT_DISTANCE] = 0.075
     """Distance of the front footholds ahead of the centre of mass, standing still [m]."""
-    feet_rear: Annotated[Positive, PLACE] = 0.148
+    feet_rear: Annotated[Positive, FOOT_DISTANCE] = 0.148
     """Distance of the rear footholds behind the centre of mass, standing still [m]."""
     horizon: Literal["stance", "multiphase"] = "stance"
     """What the prediction covers: the present stance (the paper), or a whole cycle ([multiphase],
@@ -169,7 +169,7 @@ class BoundConfig:
     """R of every force [1/N^2]."""
     force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 51.5
     """Bound of |F_x| per leg, body frame [N]."""
-    force_z_min: Annotated[Bound, LEAST_FORCE] = 20.0
+    force_z_min: Annotated[Bound, MIN_FORCE] = 20.0
     """Lower bound of F_z per leg: a foot that carries no weight slips [N]."""
     force_z_max: Annotated[Bound, FORCE] = 300.0
     """Upper bound of F_z per leg, body frame [N]."""

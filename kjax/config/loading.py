@@ -51,19 +51,19 @@ def tunable(cls: type) -> dict[str, Tunable]:
 
 
 class Overlay:
-    """A config to be read with other numbers at some keys, traced ones perhaps."""
+    """A config to be read with other values at some keys, traced ones perhaps."""
 
-    def __init__(self, config: Any, numbers: Mapping[str, Any]):
-        """The config (or a section of it), and numbers by dotted key."""
-        self._config, self._numbers = config, dict(numbers)
+    def __init__(self, config: Any, values: Mapping[str, Any]):
+        """The config (or a section of it), and values by dotted key."""
+        self._config, self._values = config, dict(values)
 
     def __getattr__(self, name: str) -> Any:
-        """The number, the section with its numbers, or what the config holds."""
-        if name in self._numbers:
-            return self._numbers[name]
+        """The value, the section with its values, or what the config holds."""
+        if name in self._values:
+            return self._values[name]
         inside = {
-            key.removeprefix(f"{name}."): number
-            for key, number in self._numbers.items()
+            key.removeprefix(f"{name}."): value
+            for key, value in self._values.items()
             if key.startswith(f"{name}.")
         }
         own = getattr(self._config, name)

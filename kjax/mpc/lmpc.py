@@ -32,7 +32,7 @@ class LmpcTables(NamedTuple):
       spread: (M, 6) standard deviation of their error over one model_dt [m, rad, m/s, rad/s].
       state_weights: (M, 6) diagonal of Q.
       input_weights: (M, 4) diagonal of R [1/N^2].
-      caution: see ``condense.cautious_weights`` [-].
+      uncertainty_discount: see ``condense.cautious_weights`` [-].
     """
 
     hessian: qp.Prepared
@@ -45,7 +45,7 @@ class LmpcTables(NamedTuple):
     spread: Float[Array, "M 6"]
     state_weights: Float[Array, "M 6"]
     input_weights: Float[Array, "M 4"]
-    caution: Float[Array, ""]
+    uncertainty_discount: Float[Array, ""]
 
 
 class LmpcMemory(NamedTuple):
@@ -88,8 +88,8 @@ def build_tables(
     horizon: int,
     feet: Float[Array, "M 2 2"],
     spread: Float[Array, "M 6"] | None = None,
-    cautious: bool = False,
-    caution: Float[Array, ""] | float = 0.0,
+    discount: bool = False,
+    uncertainty_discount: Float[Array, ""] | float = 0.0,
 ) -> LmpcTables:
     """Tables of all contact modes; call it in float64.
 
@@ -100,8 +100,8 @@ def build_tables(
       horizon: number k of prediction steps.
       feet: (M, 2, 2) nominal contact points [m].
       spread: (M, 6) standard deviation of the one-step error of each model; ``None`` for none.
-      cautious: whether uncertain steps weigh less.
-      caution: by how much, see ``condense.cautious_weights`` [-].
+      discount: whether uncertain steps weigh less.
+      uncertainty_discount: by how much, see ``condense.cautious_weights`` [-].
     """
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
     Q, R, lower, upper, u_ref = settings
@@ -113,8 +113,8 @@ def build_tables(
     def one(
         model: LinearModel, Q: Array, R: Array, feet: Array, swinging: Array, spread: Array
     ) -> tuple[qp.Prepared, Array, Array]:
-        if cautious:
-            Q = cautious_weights(model.A, Q, spread, caution, horizon)
+        if discount:
+            Q = cautious_weights(model.A, Q, spread, uncertainty_discount, horizon)
         problem = condense(model.A, input_map(model, feet), Q, R, horizon)
         return qp.prepare(problem.H, swinging), problem.F, problem.G
 
@@ -130,7 +130,7 @@ def build_tables(
         spread=spread,
         state_weights=Q,
         input_weights=R,
-        caution=jnp.asarray(caution, float),
+        uncertainty_discount=jnp.asarray(uncertainty_discount, float),
     )
 
 
@@ -212,8 +212,10 @@ def solve_lmpc(
         hessian, index, F, G = tables.hessian, mode, tables.F[mode], tables.G[mode]
     else:
         Q, R = tables.state_weights[mode], tables.input_weights[mode]
-        if spec.cautious:
-            Q = cautious_weights(model.A, Q, tables.spread[mode], tables.caution, spec.horizon)
+        if spec.discounts_uncertainty:
+            Q = cautious_weights(
+                model.A, Q, tables.spread[mode], tables.uncertainty_discount, spec.horizon
+            )
         problem = condense(model.A, model.B, Q, R, spec.horizon)
         hessian, index = qp.prepare(problem.H, lower == upper), None
         F, G = problem.F, problem.G

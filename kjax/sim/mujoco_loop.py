@@ -121,7 +121,7 @@ class Simulation(NamedTuple):
 
 
 def simulation_key(config: RunConfig) -> Hashable:
-    """What the episodes of one compiled simulation share: specs and the controller's numbers.
+    """What the episodes of one compiled simulation share: specs and the controller's parameters.
 
     Not the seed, duration, noise (but for whether it perturbs forces), pushes, times and speeds of
     the command, times of the gaits, friction, payload, delay, place and heading of the start, and
