@@ -69,7 +69,7 @@ class Axis:
 
 
 def _speed(value: float, seed: int, config: RunConfig) -> dict[str, Any]:
-    return {"command.velocities": [0.0, value]}
+    return {"command.v_x": [0.0, value]}
 
 
 def _height(value: float, seed: int, config: RunConfig) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def _steady(speed: float, duration: float) -> dict[str, Any]:
     return {
         "duration": duration,
         "command.times": [0.0, 1.0],
-        "command.velocities": [0.0, speed],
+        "command.v_x": [0.0, speed],
         "lmpc.command_slew": 2.0,
     }
 

@@ -38,7 +38,7 @@ STARTS = (0.0, 10.0, 1e3, 1e4)  # m
 FLOORS = (0.0, -2.0, -0.27, 3.0)  # m
 HEADINGS = (0.0, 1.0, 2.0)  # rad
 FLOAT32_REACH = 1e3  # m
-STEPS = {"command.times": [0.0, 1.0, 2.5], "command.velocities": [0.0, 0.1, 0.3]}
+STEPS = {"command.times": [0.0, 1.0, 2.5], "command.v_x": [0.0, 0.1, 0.3]}
 # Gait -> file and duration [s].
 GAITS = {
     "trot": ("trot_velocity.toml", 5.0),
@@ -225,7 +225,7 @@ def _base(check: str, model: str, gait: str, args: Namespace) -> RunConfig:
     if check == "heading":
         keys |= {"sim.base": "free", "sim.cone": "elliptic", "noise.enabled": False}
     if args.quick:
-        keys |= {"duration": 0.8, "command.times": [0.0, 0.5], "command.velocities": [0.0, 0.1]}
+        keys |= {"duration": 0.8, "command.times": [0.0, 0.5], "command.v_x": [0.0, 0.1]}
     return load_config(RunConfig, CONFIGS / file, keys)
 
 

@@ -117,7 +117,7 @@ def run_config(path: Path | None) -> RunConfig:
 
 def short(args: argparse.Namespace, path: Path) -> RunConfig:
     """That of a scenario."""
-    command = CommandConfig(times=(0.0,), velocities=(0.0,))
+    command = CommandConfig(times=(0.0,), v_x=(0.0,))
     return dataclasses.replace(run_config(path), duration=args.seconds, command=command)
 
 

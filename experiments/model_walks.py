@@ -180,7 +180,7 @@ def config_of(gait: str, keys: dict[str, Any]) -> RunConfig:
         "sim.contacts": "feet",
         "lmpc.command_slew": 1.0,
         "command.times": [0.0, *(2.0 * i for i in range(1, len(speeds)))],
-        "command.velocities": list(speeds),
+        "command.v_x": list(speeds),
     }
     return load_config(RunConfig, CONFIGS / GAITS[gait], {**own, **keys})
 

@@ -40,8 +40,8 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
         if i % per_tick == 0:
             kept.append(jax.tree.map(np.array, look(state, seen)))
             state, _ = plan(tables, state, seen)
-        state, torque = act(tables, state, seen)
-        data.ctrl[simulation.addresses.actuator.reshape(-1)] = np.asarray(torque).reshape(-1)
+        state, joints = act(tables, state, seen)
+        data.ctrl[simulation.addresses.actuator.reshape(-1)] = np.asarray(joints.torque).reshape(-1)
         mujoco.mj_step(model, data)
     return kept
 

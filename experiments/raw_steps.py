@@ -157,7 +157,7 @@ def steps_of(case: Case, start: float, args: Namespace) -> Iterator[tuple[float,
             phase = np.random.default_rng([seed, 16]).uniform()
             dt = base.lmpc.control_dt
             at = round(round((earliest + phase * cycle) / dt) * dt, 6)
-            command = CommandConfig(times=(0.0, at), velocities=(start, value))
+            command = CommandConfig(times=(0.0, at), v_x=(start, value))
             configs.append(dataclasses.replace(base, seed=seed, command=command, duration=duration))
         yield value, configs
 

@@ -92,7 +92,7 @@ def cases(gait: str, count: int, seconds: float) -> list[RunConfig]:
         "sim.contacts": "feet",
         "duration": seconds,
         "command.times": [0.0],
-        "command.velocities": [speed],
+        "command.v_x": [speed],
         "lmpc.command_slew": 1.0,  # none shall fall: the fallen cost nothing
     }
     config = load_config(RunConfig, CONFIGS / f"{name}.toml", overrides)
@@ -241,7 +241,7 @@ def engines_agree() -> dict[str, Any]:
         "duration": 3.0,
         "lmpc.command_slew": 1.0,
         "command.times": [0.0],
-        "command.velocities": [0.4],
+        "command.v_x": [0.4],
         "terrain.start": 0.5,
         "terrain.end": 1.4,
     }

@@ -179,7 +179,7 @@ def _parse() -> tuple[RunConfig, Namespace]:
     )
     parser.add_argument("--seeds", type=int, default=16, help="of the walks in MuJoCo at the end")
     config, args = cli.parse(RunConfig, parser)
-    args.speeds = min(config.command.velocities), max(config.command.velocities)
+    args.speeds = min(config.command.v_x), max(config.command.v_x)
     for name in ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
                  "minutes", "worsen", "memory", "seeds"):  # fmt: skip
         if not getattr(args, name) > 0:
@@ -203,7 +203,7 @@ def _settings(args: Namespace) -> list[Any]:
 
 def shortened(config: RunConfig, args: Namespace) -> RunConfig:
     """The config of a scenario."""
-    command = CommandConfig(times=(0.0,), velocities=(0.0,))
+    command = CommandConfig(times=(0.0,), v_x=(0.0,))
     return dataclasses.replace(config, duration=args.seconds, command=command)
 
 
@@ -297,7 +297,7 @@ def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
             seed=TRAIN_SEED + i,
             sim=dataclasses.replace(config.sim, contacts="feet"),
             command=CommandConfig(
-                times=times, velocities=tuple(map(float, rng.uniform(low, high, args.pieces)))
+                times=times, v_x=tuple(map(float, rng.uniform(low, high, args.pieces)))
             ),
         )
         for i in range(POPULATION_SEEDS)

@@ -47,7 +47,7 @@ def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[
             "sim.contacts": "feet",
             "noise.force": force,
             "command.times": times,
-            "command.velocities": [0.0, *rng.uniform(*chosen.speeds, len(times) - 1)],
+            "command.v_x": [0.0, *rng.uniform(*chosen.speeds, len(times) - 1)],
             **chosen.keys,
         }
         if kind.endswith("rough"):

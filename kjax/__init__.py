@@ -14,7 +14,7 @@ from kjax.observation import check_observation
 from kjax.params import ControllerParams, Tables, condense
 from kjax.resolve import resolve
 from kjax.spec import ControllerSpec
-from kjax.types import Leg, Mode, Observation
+from kjax.types import Command, JointCommand, Leg, Mode, Observation
 
 __version__ = "0.1.0"
 
@@ -28,11 +28,13 @@ def __getattr__(name: str) -> object:
 
 
 __all__ = [
+    "Command",
     "ConfigError",
     "ControlLoop",
     "Controller",
     "ControllerParams",
     "ControllerSpec",
+    "JointCommand",
     "Leg",
     "Mode",
     "Observation",

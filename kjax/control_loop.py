@@ -1,7 +1,7 @@
 """The controller for a caller's own loop: it owns the jitted calls and the clock.
 
 ``Controller`` is a record of pure functions for ``jit``, ``scan`` and ``vmap``. ``ControlLoop`` is
-for a host that has one robot, samples it and sends torques: it decides when to plan, looks at the
+for a host that has one robot, samples it and sends commands: it decides when to plan, looks at the
 first sample, and says so when it is called at another rate than the controller was built for.
 """
 
@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from kjax.command import check_command
 from kjax.controller import build_controller
 from kjax.observation import check_observation, check_shapes, standing
-from kjax.params import ControllerParams, condense
+from kjax.params import ControllerParams, condense, with_params
 from kjax.spec import ControllerSpec
 from kjax.state import ControllerState, PlanInfo
-from kjax.types import Observation
+from kjax.types import JointCommand, Observation
 
 PERIOD_TOLERANCE = 0.2  # relative error of the period that is told
 PERIOD_CALLS = 100  # calls that the period is taken over
@@ -69,14 +70,29 @@ class ControlLoop:
     def params(self, params: ControllerParams) -> None:
         self._params, self._tables = params, condense(self._spec, params)
 
+    def command(self, **columns: float) -> None:
+        """Ask for these values from now on, for 0 elsewhere; compiles nothing.
+
+        Args:
+          columns: of ``types.COMMAND_NAMES``, e.g. ``v_x=0.3``.
+
+        Raises:
+          ValueError: for a name that is no column, a value that is not finite, or another than 0
+            in a column that this controller does not follow.
+        """
+        command = self._params.command.hold(**columns)
+        check_command({name: (value,) for name, value in columns.items()})
+        self._params = self._params._replace(command=command)
+        self._tables = with_params(self._tables, command=command)
+
     def reset(self) -> None:
         """Forget the robot: the next call begins anew."""
         self.state = self.info = None
         self._next_plan = self._last = -inf
         self._periods, self._told = [], False
 
-    def step(self, observation: Observation, time: float) -> np.ndarray:
-        """Torques (4, 3) of abduction, thigh and calf, legs FR, FL, RR, RL [N m].
+    def step(self, observation: Observation, time: float) -> JointCommand:
+        """Torques and joint loops, NumPy arrays (4, 3): abduction, thigh, calf of FR, FL, RR, RL.
 
         Args:
           observation: of the robot now.
@@ -108,8 +124,8 @@ class ControlLoop:
             late = time - self._next_plan > self._controller.control_dt
             start = time if late else self._next_plan
             self._next_plan = start + self._controller.control_dt
-        self.state, torque = self._act(self._tables, self.state, observation)
-        return np.asarray(torque)
+        self.state, command = self._act(self._tables, self.state, observation)
+        return jax.device_get(command)
 
     def _as_arrays(self, observation: Observation) -> Observation:
         """The sample as arrays of one type, so that lists or float32 compile nothing again."""

@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from kjax import gait, qp
+from kjax.command import IGNORED
 from kjax.legs import contact, lateral, swing
-from kjax.legs.base import Footing, LegCommand, View, build_base
+from kjax.legs.base import Footing, LegCommand, View, build_base, to_local
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc.lmpc import start_memory
 from kjax.observation import (
@@ -31,7 +32,7 @@ from kjax.planning import ForceTask, Planner, build_planner
 from kjax.reference import next_clock, next_reference
 from kjax.spec import ControllerSpec
 from kjax.state import ControllerState, PlanInfo
-from kjax.types import Observation
+from kjax.types import COMMAND_NAMES, JointCommand, Observation
 
 
 class Controller(NamedTuple):
@@ -41,9 +42,9 @@ class Controller(NamedTuple):
       init: (tables, observation) -> state. Outside ``jit`` it raises a ValueError for a sample in
         another convention (``observation.check_observation``).
       plan: (tables, state, observation) -> (state, info), once per control_dt.
-      act: (tables, state, observation) -> (state, torque), once per act_dt; torque (4, 3) [N m]
-        of (abduction, thigh, calf) in leg order, within the robot's limits.
-      step: plan, then act: (tables, state, observation) -> (state, torque, info).
+      act: (tables, state, observation) -> (state, command), once per act_dt: a ``JointCommand``,
+        whose torques are within the robot's limits.
+      step: plan, then act: (tables, state, observation) -> (state, command, info).
       init_from: (tables, view) -> state; ``init`` for a caller that knows the view itself, such as
         a rigid body without legs (``kjax.tuning``). The view is in the local frame, see
         ``ControllerState``.
@@ -56,11 +57,11 @@ class Controller(NamedTuple):
     plan: Callable[[Tables, ControllerState, Observation], tuple[ControllerState, PlanInfo]]
     act: Callable[
         [Tables, ControllerState, Observation],
-        tuple[ControllerState, Float[Array, "4 3"]],
+        tuple[ControllerState, JointCommand],
     ]
     step: Callable[
         [Tables, ControllerState, Observation],
-        tuple[ControllerState, Float[Array, "4 3"], PlanInfo],
+        tuple[ControllerState, JointCommand, PlanInfo],
     ]
     init_from: Callable[[Tables, View], ControllerState]
     plan_from: Callable[
@@ -107,12 +108,13 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
             clock=gait.start(params.gaits[0], zero - control_dt),  # first plan: phase 0
             stance=jnp.ones((4,), bool),
             lag=zero,
-            velocity_command=zero,
+            command=jnp.zeros((len(COMMAND_NAMES),), zero.dtype),
+            height=zero,
             ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
             velocity=zero,
             correction=jnp.zeros((2,), zero.dtype),
             memory=start_memory(tables.lmpc, spec),
-            force=jnp.zeros((4, 2), zero.dtype),
+            force=jnp.zeros((4, 3), zero.dtype),
             swing=swing.initial_swing(view.feet),
             feet=view.feet,
             base_vel=view.base_vel,
@@ -163,8 +165,8 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
                 valid=valid,
                 lag=wanted.lag,
                 velocity=wanted.velocity + wanted.correction[0],
-                command=wanted.command + wanted.correction[0],
-                height=params.height[clock.gait],
+                command=wanted.command[0] + wanted.correction[0],
+                height=params.height[clock.gait] + wanted.height,
                 pitch_offset=wanted.correction[1],
                 memory=state.memory,
             ),
@@ -174,12 +176,13 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
             clock=clock,
             stance=stance,
             lag=jnp.where(valid, wanted.lag, state.lag),
-            velocity_command=wanted.command,
+            command=wanted.command,
+            height=wanted.height,
             ground=jnp.where(valid, ground, state.ground),
             velocity=wanted.velocity,
             correction=jnp.where(valid, wanted.correction, state.correction),
             memory=solved.memory,
-            force=jnp.repeat(solved.pair_force, 2, axis=0) * stance[:, None],
+            force=to_local(view, solved.force),
             swing=swings,
             feet=feet,
         )
@@ -191,17 +194,19 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
             x=_above_ground(view.planar, ground).x,
             reference=solved.reference,
             contact_fault=contact.is_faulty(state.contact),
+            command_ignored=(wanted.command[IGNORED] != 0.0).any(),
             blind_time=jnp.where(valid, 0.0, state.blind_time + act_dt),
         )
         return next_state, info
 
     def act(
         tables: Tables, state: ControllerState, observation: Observation
-    ) -> tuple[ControllerState, Array]:
+    ) -> tuple[ControllerState, JointCommand]:
         params = tables.params
         observation = cast(observation, params.position_slack.dtype)
         valid = is_valid(observation)
-        joint_vel = observation.joint_vel
+        known = jnp.abs(observation.joint_vel) <= MAX_JOINT_RATE
+        joint_vel = jnp.where(known, observation.joint_vel, 0.0)
         observation = or_neutral(observation, valid)
         robot = params.robot
         view = base.view(robot, _facing(state.track), observation)
@@ -234,13 +239,23 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         foot, foot_vel = swing.held_or_on_path(settings, swings, foot, foot_vel)
 
         # Step 3: torques, those of the last valid sample for a while, then damping.
-        command = LegCommand(state.stance & ~swings.reaching, state.force, foot, foot_vel)
-        torque = base.torque(robot, settings, sideways, view, command, observation)
+        legs = LegCommand(state.stance & ~swings.reaching, state.force, foot, foot_vel)
+        loops = base.joints(robot, settings, sideways, view, legs, observation)
         blind_time = jnp.where(valid, 0.0, state.blind_time + act_dt)
         recent = blind_time < params.hold_time + 0.5 * act_dt
-        held = jnp.where(recent, state.torque, _damping(params, joint_vel))
-        torque = jnp.where(valid, torque, held)
+        held = jnp.where(recent, state.torque, -params.blind_damping * joint_vel)
+        torque = jnp.where(valid, loops.torque, held)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
+        follows, damped = loops.follows & valid, ~valid & ~recent
+        command = _joint_command(
+            torque,
+            q=jnp.where(follows, loops.q, observation.joint_pos),
+            dq=jnp.where(follows, loops.dq, jnp.where(damped, 0.0, joint_vel)),
+            kp=jnp.where(follows, settings.kp, 0.0),
+            kd=jnp.where(follows, settings.kd, jnp.where(damped, params.blind_damping, 0.0)),
+            joint_pos=observation.joint_pos,
+            joint_vel=joint_vel,
+        )
 
         # Step 4: the local frame moves on with the trunk.
         base_vel = jnp.where(valid, view.base_vel, state.base_vel)
@@ -254,14 +269,14 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
             blind_time=blind_time,
             contact=jax.tree.map(lambda a, b: jnp.where(valid, a, b), flags.state, state.contact),
         )
-        return next_state, torque
+        return next_state, command
 
     def step(
         tables: Tables, state: ControllerState, observation: Observation
-    ) -> tuple[ControllerState, Array, PlanInfo]:
+    ) -> tuple[ControllerState, JointCommand, PlanInfo]:
         state, info = plan(tables, state, observation)
-        state, torque = act(tables, state, observation)
-        return state, torque, info
+        state, command = act(tables, state, observation)
+        return state, command, info
 
     return Controller(
         init=init,
@@ -316,7 +331,16 @@ def _facing(track: Array | None) -> Array | None:
     return jnp.where((track == 0.0).all(), jnp.array([1.0, 0.0], track.dtype), track)
 
 
-def _damping(params: ControllerParams, joint_vel: Array) -> Array:
-    """Torques (4, 3) that slow the joints down; none where their rates are not known [N m]."""
-    known = jnp.abs(joint_vel) <= MAX_JOINT_RATE
-    return -params.blind_damping * jnp.where(known, joint_vel, 0.0)
+def _joint_command(
+    torque: Array,
+    *,
+    q: Array,
+    dq: Array,
+    kp: Array,
+    kd: Array,
+    joint_pos: Array,
+    joint_vel: Array,
+) -> JointCommand:
+    """The torques, and joint loops that give them for this sample; all (4, 3)."""
+    feedforward = torque - (kp * (q - joint_pos) + kd * (dq - joint_vel))
+    return JointCommand(torque=torque, q=q, dq=dq, kp=kp, kd=kd, feedforward=feedforward)

@@ -25,13 +25,13 @@ class Fits(NamedTuple):
     Attributes:
       model: linear EDMD models over one step of the data.
       feet: (M, 2, 2) nominal contact points, body frame [m].
-      spread: (M, 6) standard deviation of the one-step error of the model in use.
+      spread: (M, n_x) standard deviation of the one-step error of the model in use.
       prediction: another prediction model, where the config names one.
     """
 
     model: LinearModel
     feet: Float[Array, "M 2 2"]
-    spread: Float[Array, "M 6"]
+    spread: Float[Array, "M n_x"]
     prediction: Prediction | None
 
 
@@ -54,9 +54,10 @@ class ControllerParams(NamedTuple):
       multiphase: LMPC over a gait cycle, for gaits that use it.
       swing: swing settings.
       lateral: regulator of roll, yaw and sideways motion; of no effect on the planar base.
-      command: forward velocity over time.
+      command: what the robot is asked to do over time.
       height: (G,) mean height of the centre of mass above the ground [m].
       command_slew: largest rate of change of the reference velocity [m/s^2].
+      height_slew: the same of the reference height [m/s].
       integral: (2, 2) integral action on velocity and pitch: its rates [1/s] and its limits
         [m/s, rad].
       position_slack: clamp of the position reference's lag [m].
@@ -80,6 +81,7 @@ class ControllerParams(NamedTuple):
     command: Command
     height: Float[Array, "G"]
     command_slew: Float[Array, ""]
+    height_slew: Float[Array, ""]
     integral: Float[Array, "2 2"]
     position_slack: Float[Array, ""]
     hold_time: Float[Array, ""]

@@ -18,7 +18,7 @@ from kjax.koopman.prediction import build_family
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc import multiphase
 from kjax.mpc.limits import force_limits
-from kjax.mpc.lmpc import LmpcMemory, reference_trajectory, shift_plan, solve_lmpc
+from kjax.mpc.lmpc import LmpcMemory, shift_plan, solve_lmpc
 from kjax.params import ControllerParams, Tables
 from kjax.spec import ControllerSpec, CycleSpec
 from kjax.types import RobotParams
@@ -58,21 +58,21 @@ class ForcePlan(NamedTuple):
     """What comes back.
 
     Attributes:
-      pair_force: (2, 2) force (x, z) per standing foot of the front and of the rear pair, now, body
-        frame [N].
+      force: (4, 3) force (x, y, z) of each leg on the robot, now, heading frame: x along the
+        trunk's heading, z up; the planar planner's have no y [N].
       memory: of the LMPC within a stance, for the next tick.
       status: a ``qp.Status``.
       residual: of the QP [-].
       iterations: of the solver.
-      reference: (6,) state wanted one step ahead.
+      reference: (n_x,) state wanted one step ahead.
     """
 
-    pair_force: Float[Array, "2 2"]
+    force: Float[Array, "4 3"]
     memory: LmpcMemory
     status: Int[Array, ""]
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
-    reference: Float[Array, "6"]
+    reference: Float[Array, "n_x"]
 
 
 Planner = Callable[[Tables, ForceTask], ForcePlan]
@@ -156,7 +156,7 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         )
         steps = jnp.where(usable, solution.plan, fallback)
         return ForcePlan(
-            pair_force=steps[:4].reshape(2, 2),
+            force=_on_legs(steps[:4].reshape(2, 2) @ body.rotation.T, task.stance),
             memory=LmpcMemory(plan=steps, mode=task.mode, warm=solution.warm),
             status=solution.status,
             residual=solution.residual,
@@ -165,6 +165,28 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         )
 
     return plan
+
+
+def reference_trajectory(
+    *,
+    position: Float[Array, ""],
+    velocity: Float[Array, ""],
+    height: Float[Array, ""],
+    periodic: Float[Array, "k 4"],
+    ahead: Float[Array, "k"],
+) -> Float[Array, "k 6"]:
+    """Reference (k, 6): constant velocity, and the gait's periodic motion about a height.
+
+    Args:
+      position: reference of p_x now [m].
+      velocity: commanded v_x [m/s].
+      height: mean of the centre of mass [m].
+      periodic: (k, 4) deviation of p_z, theta, v_z, omega; zeros for a level trunk.
+      ahead: (k,) time of each step from now [s].
+    """
+    z, theta, v_z, omega = periodic.T
+    forward = jnp.full_like(ahead, velocity)
+    return jnp.stack([position + velocity * ahead, height + z, theta, forward, v_z, omega], -1)
 
 
 def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
@@ -206,10 +228,10 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
         # feet carry what they carry in the periodic motion.
         usable = (solved.status <= qp.Status.ITERATION_LIMIT) & (solved.residual < 1e-2)
         carry = jnp.stack([jnp.zeros_like(outlook.force_z[0]), outlook.force_z[0]])
-        force = jnp.where(usable & task.valid, solved.force[0], carry) @ body.rotation
+        force = jnp.where(usable & task.valid, solved.force[0], carry)
         standing = jnp.arange(2) == nodes.end_index[0]
         return ForcePlan(
-            pair_force=jnp.where(standing[:, None], force, 0.0),
+            force=_on_legs(jnp.where(standing[:, None], force, 0.0), task.stance),
             memory=task.memory._replace(plan=jnp.zeros_like(task.memory.plan)),
             status=solved.status,
             residual=solved.residual,
@@ -218,6 +240,12 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
         )
 
     return plan
+
+
+def _on_legs(force: Float[Array, "2 2"], stance: Bool[Array, "4"]) -> Float[Array, "4 3"]:
+    """Forces (x, y, z) of all legs from the (x, z) of one front and one rear leg that stands."""
+    x, z = jnp.repeat(force, 2, axis=0).T * stance
+    return jnp.stack([x, jnp.zeros_like(x), z], axis=-1)
 
 
 def _motion(

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from kjax import gait
+from kjax.command import HEIGHT, V_X
 from kjax.legs.kinematics import PlanarState
 from kjax.params import ControllerParams
 from kjax.planning import periodic_motion
@@ -17,14 +18,16 @@ class Reference(NamedTuple):
 
     Attributes:
       lag: reference of p_x less p_x [m].
-      command: velocity commanded [m/s].
+      command: (6,) in force, order of ``types.COMMAND_NAMES``.
       velocity: reference of v_x, on its way to the command [m/s].
+      height: reference of the height above the gait's own, likewise [m].
       correction: (2,) added to the references of velocity and pitch [m/s, rad].
     """
 
     lag: Float[Array, ""]
-    command: Float[Array, ""]
+    command: Float[Array, "6"]
     velocity: Float[Array, ""]
+    height: Float[Array, ""]
     correction: Float[Array, "2"]
 
 
@@ -44,10 +47,11 @@ def next_reference(
       body: as it is now.
       control_dt: of a tick [s].
     """
-    command = params.command.velocities[_piece(params.command.times, state.time)]
-    command = jnp.where(jnp.isfinite(command), command, state.velocity_command)
-    change = params.command_slew * control_dt
-    velocity = state.velocity + jnp.clip(command - state.velocity, -change, change)
+    command = params.command.values[_piece(params.command.times, state.time)]
+    command = jnp.where(jnp.isfinite(command), command, state.command)
+    change, climb = params.command_slew * control_dt, params.height_slew * control_dt
+    velocity = state.velocity + jnp.clip(command[V_X] - state.velocity, -change, change)
+    height = state.height + jnp.clip(command[HEIGHT] - state.height, -climb, climb)
     periodic_ref = periodic_motion(params, clock.gait, clock.phase, clock.cycle, clock.elapsed)
     error = jnp.stack([velocity - body.x[3], periodic_ref[1] - body.x[2]])
     rate, limit = params.integral
@@ -58,7 +62,7 @@ def next_reference(
     correction = jnp.where(switched, 0.0, jnp.clip(correction, -limit, limit))
     slack = params.position_slack
     lag = state.lag + (velocity + correction[0] - body.x[3]) * control_dt
-    return Reference(jnp.clip(lag, -slack, slack), command, velocity, correction)
+    return Reference(jnp.clip(lag, -slack, slack), command, velocity, height, correction)
 
 
 def next_clock(params: ControllerParams, state: ControllerState, control_dt: float) -> gait.Clock:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax import gait
-from kjax.config import KoopmanConfig, Overlay, RunConfig, SrbConfig
+from kjax.config import CommandConfig, KoopmanConfig, Overlay, RunConfig, SrbConfig
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import fit_modes, srb_params
 from kjax.koopman.prediction import build_prediction, model_spec
@@ -24,7 +24,7 @@ from kjax.mpc.lmpc import ModeSettings
 from kjax.params import ControllerParams, Fits
 from kjax.rigid_body import body_numbers, mean_force, own_body
 from kjax.spec import ControllerSpec, CycleSpec
-from kjax.types import MODE_ALPHA, Command, Mode, RobotParams
+from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams
 from kjax.walkable import build_gaits, check_walkable, cycle_nodes
 
 
@@ -216,12 +216,10 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
             ),
             foothold_gain=jnp.asarray(sideways.velocity_gain),
         ),
-        command=Command(
-            times=jnp.asarray(config.command.times),
-            velocities=jnp.asarray(config.command.velocities),
-        ),
+        command=build_command(config.command),
         height=jnp.where(is_bound, bound.height, config.lmpc.height),
         command_slew=jnp.asarray(config.lmpc.command_slew, float),
+        height_slew=jnp.asarray(config.lmpc.height_slew, float),
         integral=jnp.stack(
             [jnp.asarray(config.lmpc.integral_gains), jnp.asarray(config.lmpc.integral_limits)]
         ),
@@ -229,6 +227,13 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
         hold_time=jnp.asarray(leg.hold_time),
         blind_damping=jnp.asarray(leg.blind_damping),
     )
+
+
+def build_command(command: CommandConfig) -> Command:
+    """The command of a config as arrays, NumPy in float64."""
+    columns = [getattr(command, name) or [0.0] * len(command.times) for name in COMMAND_NAMES]
+    values = np.stack([np.asarray(column, float) for column in columns], axis=-1)
+    return Command(np.asarray(command.times, float), values)  # type: ignore[arg-type]
 
 
 _fit_modes = jax.jit(fit_modes, static_argnames="config")

@@ -22,13 +22,16 @@ class ControllerState(NamedTuple):
       clock: place in the gait.
       stance: (4,) scheduled stance legs.
       lag: reference of p_x less p_x, the integral of the velocity's error, bounded [m].
-      velocity_command: velocity commanded now [m/s].
+      command: (6,) in force now, order of ``types.COMMAND_NAMES``.
+      height: reference of the height above the gait's own, which follows the command at a bounded
+        rate [m].
       ground: height of the ground under the last stance feet, local frame [m].
       velocity: reference of v_x, which follows the command at a bounded rate [m/s].
       correction: integrals of the errors of velocity and pitch, added to their references
         [m/s, rad].
       memory: of the LMPC within a stance: its last plan and where the QP goes on from.
-      force: (4, 2) force (x, z) that each leg shall put on the robot now, body frame [N].
+      force: (4, 3) force that each leg shall put on the robot, local axes; it holds in them until
+        the next plan [N].
       swing: state of the swing legs, local frame.
       feet: (4, d) foot centres in the last valid sample, local frame [m].
       base_vel: (d,) velocity of the trunk in that sample, local axes [m/s].
@@ -43,12 +46,13 @@ class ControllerState(NamedTuple):
     clock: gait.Clock
     stance: Bool[Array, "4"]
     lag: Float[Array, ""]
-    velocity_command: Float[Array, ""]
+    command: Float[Array, "6"]
+    height: Float[Array, ""]
     ground: Float[Array, ""]
     velocity: Float[Array, ""]
     correction: Float[Array, "2"]
     memory: LmpcMemory
-    force: Float[Array, "4 2"]
+    force: Float[Array, "4 3"]
     swing: SwingState
     feet: Float[Array, "4 d"]
     base_vel: Float[Array, "d"]
@@ -67,10 +71,11 @@ class PlanInfo(NamedTuple):
       residual: relative KKT residual of the solver's point [-].
       iterations: of the solver.
       mode: contact mode.
-      x: (6,) SRB state as estimated from the observation; p_x and p_z from the ground below the
-        centre of mass [m, rad, m/s, rad/s].
-      reference: (6,) state wanted one model step ahead, likewise.
+      x: (n_x,) state of the prediction as estimated from the observation; p_x and p_z from the
+        ground below the centre of mass [m, rad, m/s, rad/s].
+      reference: (n_x,) state wanted one model step ahead, likewise.
       contact_fault: (4,) legs whose contact flag keeps contradicting their kinematics.
+      command_ignored: whether the command asks for what this controller does not follow.
       blind_time: time without a valid sample, this one included [s].
     """
 
@@ -78,7 +83,8 @@ class PlanInfo(NamedTuple):
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     mode: Int[Array, ""]
-    x: Float[Array, "6"]
-    reference: Float[Array, "6"]
+    x: Float[Array, "n_x"]
+    reference: Float[Array, "n_x"]
     contact_fault: Bool[Array, "4"]
+    command_ignored: Bool[Array, ""]
     blind_time: Float[Array, ""]

@@ -97,13 +97,57 @@ class RobotParams(NamedTuple):
     torque_limit: Float[Array, "3"]
 
 
+COMMAND_NAMES = ("v_x", "v_y", "yaw_rate", "height", "roll", "pitch")
+COMMAND_UNITS = ("m/s", "m/s", "rad/s", "m", "rad", "rad")
+
+
 class Command(NamedTuple):
-    """Forward velocity command, piecewise constant in time.
+    """What the robot is asked to do, piecewise constant in time.
 
     Attributes:
       times: start of each piece, increasing, the first one 0 [s].
-      velocities: velocity that holds from that time on [m/s].
+      values: (pieces, 6) what holds from that time on, order of ``COMMAND_NAMES``: velocity along
+        the heading and to the left [m/s], yaw rate [rad/s], height of the centre of mass above the
+        gait's own [m], roll and pitch [rad]. The planar controller follows the first and fourth.
     """
 
     times: Float[Array, "pieces"]
-    velocities: Float[Array, "pieces"]
+    values: Float[Array, "pieces 6"]
+
+    def hold(self, **columns: float) -> "Command":
+        """A command of the same shape that asks for these values at all times, for 0 elsewhere.
+
+        Args:
+          columns: by name, e.g. ``v_x=0.3``.
+        """
+        unknown = sorted(columns.keys() - set(COMMAND_NAMES))
+        if unknown:
+            raise ValueError(f"{unknown[0]}: no column of a command, wanted {list(COMMAND_NAMES)}")
+        row = np.array([columns.get(name, 0.0) for name in COMMAND_NAMES], float)
+        values = np.broadcast_to(row, np.shape(self.values))
+        return self._replace(values=values)  # type: ignore[arg-type]
+
+
+class JointCommand(NamedTuple):
+    """What the joints are told; (leg, joint), legs FR, FL, RR, RL by abduction, thigh, calf.
+
+    A torque-controlled joint takes ``torque``. A motor with its own fast loop takes the other five
+    and gives, for the sample that they were made from, the same:
+
+        torque = feedforward + kp (q - joint_pos) + kd (dq - joint_vel)
+
+    Attributes:
+      torque: within the robot's limits [N m].
+      q: angle wanted; the measured one where there is no stiffness [rad].
+      dq: rate wanted; the measured one where there is no damping [rad/s].
+      kp: stiffness of the joint's loop; 0 in stance [N m/rad].
+      kd: its damping; 0 in stance [N m s/rad].
+      feedforward: torque besides those [N m].
+    """
+
+    torque: Float[Array, "4 3"]
+    q: Float[Array, "4 3"]
+    dq: Float[Array, "4 3"]
+    kp: Float[Array, "4 3"]
+    kd: Float[Array, "4 3"]
+    feedforward: Float[Array, "4 3"]

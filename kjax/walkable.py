@@ -5,10 +5,11 @@ import warnings
 import numpy as np
 
 from kjax import gait
+from kjax.command import check_command
 from kjax.config import Overlay, RunConfig
 from kjax.legs.kinematics import REACH
 from kjax.rigid_body import nominal_feet, own_body
-from kjax.types import GRAVITY, MODE_ALPHA, Mode, RobotParams
+from kjax.types import COMMAND_NAMES, GRAVITY, MODE_ALPHA, Mode, RobotParams
 
 MARGIN = 1.2  # least impulse that the feet can give over a cycle, over the weight's
 FACTOR = {"mass": 2.0, "inertia": 4.0}  # from the robot's own that srb may be
@@ -59,6 +60,7 @@ def check_walkable(config: RunConfig, robot: RobotParams) -> None:
     Warns:
       UserWarning: for another mass than the robot's.
     """
+    check_command({name: getattr(config.command, name) for name in COMMAND_NAMES})
     _check_body(config, robot)
     gaits = build_gaits(config)
     nodes = [bool(row.any()) for row in cycle_nodes(gaits, config)]
@@ -183,9 +185,13 @@ def _check_reach(config: RunConfig, robot: RobotParams, name: str) -> None:
     height = getattr(config, section).height
     low, high = np.array(REACH) * float(robot.thigh_length + robot.calf_length)
     drop = _drop(config, robot, name)
-    if not low < drop < high:
+    asked = (0.0, *config.command.height)
+    if not (low < drop + min(asked) and drop + max(asked) < high):
+        key = f"{section}.height is {height:g} m"
+        if any(asked):
+            key += f" and command.height {min(asked):+g} to {max(asked):+g} m"
         raise ValueError(
-            f"{section}.height is {height:g} m; the legs reach {low:.3g} to {high:.3g} m below the "
+            f"{key}; the legs reach {low:.3g} to {high:.3g} m below the "
             f"hips, so that it must be about {low + height - drop:.2f} to "
             f"{high + height - drop:.2f} m"
         )

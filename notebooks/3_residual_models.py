@@ -48,7 +48,7 @@ configs = [
             "noise.force": 15.0,
             "lmpc.command_slew": 1.0,
             "command.times": [0.0, 1.0],
-            "command.velocities": [0.0, float(np.linspace(-0.1, 0.5, ROBOTS)[seed])],
+            "command.v_x": [0.0, float(np.linspace(-0.1, 0.5, ROBOTS)[seed])],
         },
     )
     for seed in range(ROBOTS)

@@ -25,9 +25,7 @@ from kjax.sim.episode import initial_state
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.scene import build_model
 
-config = load_config(
-    RunConfig, None, {"command.times": [0.0, 0.5], "command.velocities": [0.0, 0.4]}
-)
+config = load_config(RunConfig, None, {"command.times": [0.0, 0.5], "command.v_x": [0.0, 0.4]})
 
 # %% [markdown]
 # ## The controller
@@ -62,8 +60,8 @@ def walk(tables, seconds):
         if step % 5 == 0:
             state, info = plan(tables, state, seen)
             speed.append(float(info.x[3]))
-        state, torque = act(tables, state, seen)
-        data.ctrl[actuator] = np.asarray(torque).reshape(-1)
+        state, joints = act(tables, state, seen)
+        data.ctrl[actuator] = np.asarray(joints.torque).reshape(-1)
         mujoco.mj_step(model, data)
     return np.array(speed)
 
@@ -78,7 +76,7 @@ speed = walk(tables, 3.0)
 
 # %%
 command = params.command
-slower = command._replace(velocities=0.5 * command.velocities)
+slower = command._replace(values=0.5 * command.values)
 speed = np.concatenate([speed, walk(with_params(tables, command=slower), 3.0)])
 plt.figure(figsize=(7, 3), layout="constrained")
 plt.plot(0.005 * np.arange(len(speed)), speed)

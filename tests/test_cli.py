@@ -33,8 +33,8 @@ def test_any_key_can_be_overridden_by_its_dotted_name():
 
 
 def test_lists_are_written_as_in_toml():
-    config, _ = parse("--command.times", "[0, 1]", "--command.velocities", "[-0.1, 0.2]")
-    assert config.command.velocities == (-0.1, 0.2)
+    config, _ = parse("--command.times", "[0, 1]", "--command.v_x", "[-0.1, 0.2]")
+    assert config.command.v_x == (-0.1, 0.2)
     config, _ = parse("--gait.names", '["trot", "bound"]', "--gait.times=[0, 2.5]")
     assert config.gait.names == ("trot", "bound")
     assert config.gait.times == (0.0, 2.5)

@@ -12,7 +12,7 @@ from kjax import control_loop
 from kjax.control_loop import PERIOD_CALLS, ControlLoop
 from kjax.controller import Controller
 from kjax.robots import go1
-from kjax.types import Observation, RobotParams
+from kjax.types import JointCommand, Observation, RobotParams
 
 
 class Stub:
@@ -32,7 +32,9 @@ class Stub:
 
         def act(params, state, observation):
             self.traced += 1
-            return state | {"acts": state["acts"] + 1}, jnp.full((4, 3), state["plans"])
+            return state | {"acts": state["acts"] + 1}, JointCommand(
+                *[jnp.full((4, 3), state["plans"])] * 6
+            )
 
         return Controller(
             init=init, plan=plan, act=act, step=None, init_from=None, plan_from=None,
@@ -107,7 +109,7 @@ def test_nothing_is_compiled_at_the_first_sample(loop_of):
 def test_it_plans_at_the_control_rate_whatever_clock_it_is_given(loop_of):
     for start in (0.0, 1.7e9 * 1e-3):  # a computer's uptime
         loop = loop_of(Stub())
-        plans = [loop.step(sample(), start + 0.001 * i)[0, 0] for i in range(20)]
+        plans = [loop.step(sample(), start + 0.001 * i).torque[0, 0] for i in range(20)]
         assert plans == [1] * 5 + [2] * 5 + [3] * 5 + [4] * 5
 
 
@@ -115,7 +117,7 @@ def test_after_a_pause_it_plans_at_once_and_goes_on_at_its_rate(loop_of):
     loop = loop_of(Stub())
     for i in range(4):
         loop.step(sample(), 0.001 * i)
-    plans = [loop.step(sample(), 1.0 + 0.001 * i)[0, 0] for i in range(10)]
+    plans = [loop.step(sample(), 1.0 + 0.001 * i).torque[0, 0] for i in range(10)]
     assert plans == [2] * 5 + [3] * 5
 
 
@@ -126,7 +128,7 @@ def test_a_time_that_does_not_run_on_is_refused(loop_of, time):
     with pytest.raises(ValueError, match=r"time must run on from 0\.003 s, got .* reset\(\)"):
         loop.step(sample(), time)
     loop.reset()
-    assert loop.step(sample(), 0.0)[0, 0] == 1
+    assert loop.step(sample(), 0.0).torque[0, 0] == 1
 
 
 def test_another_rate_than_the_controllers_is_told_once(loop_of):
@@ -145,7 +147,10 @@ def test_another_rate_than_the_controllers_is_told_once(loop_of):
 def test_a_flag_that_is_no_number_does_not_stop_a_walk(loop_of):
     loop = loop_of(Stub())
     loop.step(sample(), 0.0)
-    assert loop.step(sample(contact=np.array([1.0, np.nan, 1.0, 1.0])), 0.001).shape == (4, 3)
+    assert loop.step(sample(contact=np.array([1.0, np.nan, 1.0, 1.0])), 0.001).torque.shape == (
+        4,
+        3,
+    )
 
 
 def test_pauses_are_no_rate(loop_of):

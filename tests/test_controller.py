@@ -13,8 +13,9 @@ from kjax import Observation, RunConfig, build_controller, load_config, qp
 from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, LmpcConfig
 from kjax.koopman import families, prediction, storage
 from kjax.legs.base import build_base
-from kjax.mpc.lmpc import reference_trajectory, solve_lmpc
+from kjax.mpc.lmpc import solve_lmpc
 from kjax.params import condense, with_params
+from kjax.planning import reference_trajectory
 from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
 from kjax.types import Leg, Mode
@@ -102,14 +103,14 @@ def test_swing_legs_get_no_force_and_stance_legs_carry_about_the_weight(controll
     assert (force[[Leg.FL, Leg.RR]] == 0.0).all()
     weight = go1.PARAMS.mass * 9.81
     # R pulls to the mean force; 1 %: the body is off its references by the fit's rounding only.
-    assert force[:, 1].sum() == pytest.approx(weight, rel=0.01)
+    assert force[:, 2].sum() == pytest.approx(weight, rel=0.01)
 
 
 def test_a_lower_body_asks_for_more_force_and_a_slow_one_for_a_push(controller, tables, plan):
     base = np.asarray(after_first_plan(controller, tables, plan)[0].force).sum(axis=0)
     low = standing(com_height=0.265)
-    assert np.asarray(after_first_plan(controller, tables, plan, low)[0].force).sum(axis=0)[1] > (
-        base[1] + 5.0
+    assert np.asarray(after_first_plan(controller, tables, plan, low)[0].force).sum(axis=0)[2] > (
+        base[2] + 5.0
     )
     slow = standing(base_vel=[-0.1, 0.0, 0.0])
     assert np.asarray(after_first_plan(controller, tables, plan, slow)[0].force).sum(axis=0)[0] > (
@@ -121,8 +122,9 @@ def test_stance_torques_press_with_the_planned_force(controller, tables, plan, a
     """Virtual work against the planned force, by finite differences of the foot position."""
     observation = standing()
     state, _ = after_first_plan(controller, tables, plan, observation)
-    state = state._replace(force=jnp.tile(jnp.array([10.0, 60.0]), (4, 1)))
-    _, torque = act(tables, state, observation)
+    state = state._replace(force=jnp.tile(jnp.array([10.0, 0.0, 60.0]), (4, 1)))
+    _, joints = act(tables, state, observation)
+    torque = joints.torque
 
     def foot(q1, q2):
         l1, l2 = go1.THIGH_LENGTH, go1.CALF_LENGTH
@@ -143,7 +145,8 @@ def test_stance_torques_press_with_the_planned_force(controller, tables, plan, a
 def test_torques_stay_within_the_robots_limits(controller, tables, plan, act):
     state, _ = after_first_plan(controller, tables, plan)
     wild = standing(joint_pos=np.tile([0.8, 4.0, -0.9], (4, 1)), joint_vel=np.full((4, 3), 30.0))
-    _, torque = act(tables, state, wild)
+    _, joints = act(tables, state, wild)
+    torque = joints.torque
     assert (np.abs(torque) <= go1.PARAMS.torque_limit).all()
     assert (np.abs(torque) == go1.PARAMS.torque_limit).any()
 
@@ -155,9 +158,9 @@ def test_state_keeps_its_tree_shapes_and_types(controller, dtype, config):
     observation = standing(dtype)
     state = jax.eval_shape(controller.init, tables, observation)
     planned, _ = jax.eval_shape(controller.plan, tables, state, observation)
-    acted, torque = jax.eval_shape(controller.act, tables, planned, observation)
+    acted, joints = jax.eval_shape(controller.act, tables, planned, observation)
     chex.assert_trees_all_equal_shapes_and_dtypes(state, planned, acted)
-    assert torque.dtype == dtype
+    assert all((part.shape, part.dtype) == ((4, 3), dtype) for part in joints)
     assert all(
         leaf.dtype == dtype
         for leaf in jax.tree.leaves(state)
@@ -187,7 +190,7 @@ def test_one_trace_serves_all_gaits_commands_and_phases(controller, tables):
             tables,
             gaits=jnp.asarray([gait], jnp.int32),
             command=tables.params.command._replace(
-                velocities=tables.params.command.velocities + 0.1
+                values=tables.params.command.values.at[:, 0].add(0.1)
             ),
         )
         state, info = counted(other, controller.init(other, observation), observation)
@@ -237,7 +240,7 @@ def test_a_bound_is_front_stance_flight_rear_stance_flight(two_bounds):
 def test_no_leg_in_the_air_has_a_force_and_every_leg_on_the_ground_has_one(two_bounds):
     states, _ = two_bounds
     np.testing.assert_array_equal(states.force[~states.stance], 0.0)
-    assert (states.force[states.stance][:, 1] >= 20.0).all()
+    assert (states.force[states.stance][:, 2] >= 20.0).all()
 
 
 def test_legs_swing_from_the_end_of_their_stance_to_its_next_beginning(two_bounds):
@@ -312,7 +315,7 @@ def test_each_mode_presses_within_its_own_limits_and_reaches_them(box, mode, lea
         force, stance = np.asarray(state.force), np.asarray(state.stance)
         np.testing.assert_array_equal(stance, STANCE[mode])
         np.testing.assert_array_equal(force[~stance], 0.0)
-        np.testing.assert_array_equal(force[stance, 1], limit)
+        np.testing.assert_array_equal(force[stance, 2], limit)
         assert (np.abs(force[stance, 0]) <= sideways).all()
         assert (np.abs(force[stance, 0]) == sideways).any()
 
@@ -419,7 +422,7 @@ def test_the_reference_velocity_follows_the_command_at_its_largest_rate(
     controller, plan, slew, ticks
 ):
     """From rest to -0.5 m/s at 200 Hz, and the reference position is its integral."""
-    chosen = {"command.velocities": [-0.5] * 5, "lmpc.command_slew": slew}
+    chosen = {"command.v_x": [-0.5] * 5, "lmpc.command_slew": slew}
     chosen |= {"lmpc.position_slack": 1.0}
     tables = condense(
         *resolve(load_config(RunConfig, None, {"sim.base": "planar", **chosen}), go1.PARAMS)
@@ -430,7 +433,7 @@ def test_the_reference_velocity_follows_the_command_at_its_largest_rate(
     np.testing.assert_allclose(states.velocity, ramp, rtol=0, atol=1e-14)
     np.testing.assert_allclose(infos.reference[:, 3], ramp, rtol=0, atol=1e-14)
     np.testing.assert_allclose(states.lag, 0.005 * np.cumsum(ramp), rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(states.velocity_command, -0.5)
+    np.testing.assert_array_equal(states.command[:, 0], -0.5)
 
 
 @pytest.mark.parametrize("rise", [0.07, 0.0, -0.27, -2.0, 1e4])
@@ -488,7 +491,8 @@ def test_a_bound_s_feet_swing_to_their_own_footholds(controller, bound_tables, p
     assert int(info.mode) == Mode.FLIGHT
     # At the end of the swing each foot is to be on its foothold, at rest.
     swing = state.swing._replace(elapsed=jnp.full(4, 0.25), duration=jnp.full(4, 0.25))
-    _, torque = act(bound_tables, state._replace(swing=swing), observation)
+    _, joints = act(bound_tables, state._replace(swing=swing), observation)
+    torque = joints.torque
     feet = np.asarray(observation.base_pos)[0] + np.array([0.075, 0.075, -0.148, -0.148])
     expected = []
     for leg in Leg:
@@ -511,9 +515,7 @@ def knee_backward(foot):
 
 
 def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller, tables, plan):
-    stepped = with_params(
-        tables, command=tables.params.command._replace(velocities=jnp.full(5, 0.4))
-    )
+    stepped = with_params(tables, command=tables.params.command.hold(v_x=0.4))
     state = controller.init(stepped, standing())
     velocities = []
     for _ in range(30):
@@ -521,7 +523,7 @@ def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller
         velocities.append(float(state.velocity))
     # 4 m/s^2 at 200 Hz: 0.02 m/s a tick, 0.4 m/s after 20 of them
     np.testing.assert_allclose(velocities, np.minimum(0.02 * np.arange(1, 31), 0.4), atol=1e-12)
-    assert float(state.velocity_command) == 0.4
+    assert float(state.command[0]) == 0.4
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -533,7 +535,8 @@ def test_a_non_finite_observation_is_reported_and_spreads_nowhere(
     broken = good._replace(joint_vel=good.joint_vel.at[2, 1].set(bad))
     state, info = plan(tables, state, broken)
     assert int(info.status) == qp.Status.NON_FINITE
-    state, torque = act(tables, state, broken)
+    state, joints = act(tables, state, broken)
+    torque = joints.torque
     assert (np.asarray(torque) == 0.0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
     state, info = plan(tables, state, good)

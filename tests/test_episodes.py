@@ -22,7 +22,7 @@ SHORT = {
     "sim.base": "planar",
     "duration": 0.7,
     "command.times": [0.0, 0.3],
-    "command.velocities": [0.0, 0.2],
+    "command.v_x": [0.0, 0.2],
 }
 WALL = {"plan_ms_median", "plan_ms_p99", "act_ms_median", "act_ms_p99", "realtime_factor"}
 
@@ -225,7 +225,7 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
             "duration": 0.7,
             "seed": 4,
             "command.times": [0.0, 0.1],
-            "command.velocities": [0.1, 0.3],
+            "command.v_x": [0.1, 0.3],
             "gait.names": ["trot", "bound"],
             "gait.times": [0.0, 0.4],
             "sim.friction": 0.6,

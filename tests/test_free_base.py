@@ -77,8 +77,8 @@ def torques(controller, tables, observations, ticks=3):
     for observation in observations[:ticks]:
         state, info = controller.plan(tables, state, observation)
         assert int(info.status) == qp.Status.SOLVED
-        state, torque = controller.act(tables, state, observation)
-        out.append(np.asarray(torque))
+        state, joints = controller.act(tables, state, observation)
+        out.append(np.asarray(joints.torque))
     return np.stack(out), state
 
 
@@ -101,15 +101,23 @@ def test_a_turn_after_the_start_is_turned_back(free, tables):
         state = free.init(tables, level)
         state, _ = free.plan(tables, state, level)
         there = seen_from(level, turned, (0.0, 0.0))
-        _, torque = free.act(tables, state, there)
-        _, straight = free.act(tables, state, level)
-        moment = yaw_moment(there, torque, state.stance) - yaw_moment(level, straight, state.stance)
+        turned_back, straight = (
+            yaw_moment(seen, free.act(tables, state, seen)[1].torque, state.stance)
+            for seen in (there, level)
+        )
+        moment = turned_back - straight
         # -20 N m/rad on 0.1 rad; two feet on a line give it but for the forces' own weight.
         assert moment == pytest.approx(-20.0 * turned, abs=0.4)
 
 
 def yaw_moment(observation, torque, stance):
-    """Moment of the stance feet about the vertical through the trunk, by MuJoCo's Jacobians."""
+    """Moment of the stance feet about the vertical through the trunk."""
+    forces, arms = pressed(observation, torque, stance)
+    return np.sum(arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0])
+
+
+def pressed(observation, torque, stance):
+    """Forces on the stance feet, world frame, and their arms, by MuJoCo's Jacobians."""
     spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
     spec.body("trunk").add_freejoint(name="root")
     model = spec.compile()
@@ -117,15 +125,33 @@ def yaw_moment(observation, torque, stance):
     data.qpos[:3], data.qpos[3:7] = observation.base_pos, observation.base_quat
     data.qpos[7:] = np.asarray(observation.joint_pos).reshape(-1)
     mujoco.mj_forward(model, data)
-    total = 0.0
+    forces, arms = [], []
     for leg in np.flatnonzero(stance):
         J = np.zeros((3, model.nv))
         foot = model.geom(f"{Leg(leg).name}_foot").id
         mujoco.mj_jacGeom(model, data, J, None, foot)
-        force = -np.linalg.solve(J[:, 6 + 3 * leg : 9 + 3 * leg].T, np.asarray(torque)[leg])
-        arm = data.geom_xpos[foot] - data.subtree_com[model.body("trunk").id]
-        total += arm[0] * force[1] - arm[1] * force[0]
-    return total
+        forces.append(-np.linalg.solve(J[:, 6 + 3 * leg : 9 + 3 * leg].T, np.asarray(torque)[leg]))
+        arms.append(data.geom_xpos[foot] - data.subtree_com[model.body("trunk").id])
+    return np.array(forces), np.array(arms)
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.15, 0.0), (0.0, 0.0, 0.2), (0.1, -0.1, -0.1)])
+def test_a_planned_force_holds_in_the_world_while_the_trunk_turns(free, tables, tilt):
+    """What the friction pyramid allows when it is planned it allows until the next plan."""
+    inactive = with_params(
+        tables,
+        lateral=tables.params.lateral._replace(weights=jnp.zeros(6), friction=jnp.full(3, 1e6)),
+    )
+    level = disturbed(1, planar=True, scale=0.05)._replace(contact=jnp.ones(4, bool))
+    state, _ = free.plan(inactive, free.init(inactive, level), level)
+    quat = np.zeros(4)
+    mujoco.mju_euler2Quat(quat, np.array(tilt), "xyz")
+    seen = level._replace(base_quat=jnp.asarray(quat))
+    state, joints = free.act(inactive, state, seen)
+    forces, _ = pressed(seen, joints.torque, state.stance)
+    planned = np.asarray(state.force)[np.asarray(state.stance)]
+    assert (planned[:, 2] > 10.0).all()
+    np.testing.assert_allclose(forces, planned, rtol=0, atol=1e-9)
 
 
 def test_without_a_regulator_a_planar_state_gives_the_planar_controller_s_torques(free, tables):
@@ -135,7 +161,7 @@ def test_without_a_regulator_a_planar_state_gives_the_planar_controller_s_torque
     )
     history = [disturbed(seed, planar=True, scale=0.05) for seed in range(3)]
     ours, state = torques(free, inactive, history)
-    assert (np.asarray(state.force)[[0, 3], 1] > 10.0).all()  # feet that need not pull
+    assert (np.asarray(state.force)[[0, 3], 2] > 10.0).all()  # feet that need not pull
     theirs, flat = torques(compiled(PLANAR), tables, history)
     # Thigh and calf everywhere; abduction where the leg swings: in stance the planar robot's is
     # held, the free one's carries its share.  Rounding times gains, and the QP's tolerance.
@@ -153,9 +179,9 @@ def test_state_keeps_its_tree_shapes_and_types(dtype):
     observation = disturbed(0, dtype=dtype)
     state = jax.eval_shape(controller.init, tables, observation)
     planned, _ = jax.eval_shape(controller.plan, tables, state, observation)
-    acted, torque = jax.eval_shape(controller.act, tables, planned, observation)
+    acted, joints = jax.eval_shape(controller.act, tables, planned, observation)
     chex.assert_trees_all_equal_shapes_and_dtypes(state, planned, acted)
-    assert torque.dtype == dtype
+    assert all((part.shape, part.dtype) == ((4, 3), dtype) for part in joints)
     assert state.swing.lift_off.shape == (4, 3)
 
 
@@ -176,8 +202,8 @@ def test_a_non_finite_observation_is_reported_and_spreads_nowhere(free, tables, 
     broken = good._replace(**{field: jnp.full_like(values, jnp.nan)})
     state, info = free.plan(tables, state, broken)
     assert int(info.status) == qp.Status.NON_FINITE
-    state, torque = free.act(tables, state, broken)
-    np.testing.assert_array_equal(torque, 0.0)
+    state, joints = free.act(tables, state, broken)
+    np.testing.assert_array_equal(joints.torque, 0.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
     state, info = free.plan(tables, state, good)
     assert int(info.status) == qp.Status.SOLVED
@@ -202,7 +228,7 @@ def test_the_gradient_through_act_is_finite_on_the_free_base(tables):
     state, _ = controller.plan(tables, controller.init(tables, seen), seen)
 
     def cost(tables, seen):
-        return jnp.sum(controller.act(tables, state, seen)[1] ** 2)
+        return jnp.sum(controller.act(tables, state, seen)[1].torque ** 2)
 
     slopes = jax.jit(jax.grad(cost, (0, 1), allow_int=True))(tables, seen)
     for leaf in jax.tree.leaves(slopes):

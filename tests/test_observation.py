@@ -185,7 +185,7 @@ def test_one_useless_sample_changes_nothing_that_is_sensed(tables, calls, name):
     init, plan, act = calls
     good = standing()
     state, _ = plan(tables, init(tables, good), good)
-    state, torque = act(tables, state, good)
+    state, joints = act(tables, state, good)
     for values in USELESS[name]:
         bad = good._replace(**{name: values})
         assert not bool(is_valid(jax.tree.map(jnp.asarray, bad)))
@@ -193,7 +193,8 @@ def test_one_useless_sample_changes_nothing_that_is_sensed(tables, calls, name):
         assert int(info.status) == qp.Status.NON_FINITE
         acted, held = act(tables, planned, bad)
         assert finite((planned, acted, held))
-        np.testing.assert_array_equal(held, torque)  # the last command holds
+        np.testing.assert_array_equal(held.torque, joints.torque)  # the last command holds
+        np.testing.assert_array_equal(held.feedforward, joints.torque)  # no loop on such a sample
         # What comes from the clock goes on, what is sensed stays: the robot is at rest.
         assert float(acted.time) > float(state.time)
         for field in ("lag", "ground", "feet", "base_vel", "correction"):
@@ -206,22 +207,26 @@ def test_without_samples_the_last_torque_holds_for_a_while_and_turns_into_dampin
     init, plan, act = calls
     good = standing()
     state, _ = plan(tables, init(tables, good), good)
-    state, torque = act(tables, state, good)
+    state, joints = act(tables, state, good)
     rates = 0.1 * np.arange(12.0).reshape(4, 3)
     blind = good._replace(base_quat=np.zeros(4), joint_vel=rates)
     torques = []
     for _ in range(30):
         state, one = act(tables, state, blind)
-        torques.append(np.asarray(one))
+        torques.append(np.asarray(one.torque))
     hold = round(CONFIG.leg.hold_time / CONFIG.leg.act_dt)
-    np.testing.assert_array_equal(torques[:hold], np.tile(torque, (hold, 1, 1)))
+    np.testing.assert_array_equal(torques[:hold], np.tile(joints.torque, (hold, 1, 1)))
     np.testing.assert_allclose(torques[hold + 1 :], np.tile(-2.0 * rates, (29 - hold, 1, 1)))
+    # A motor's own damping slows its joint down at whatever rate that has.
+    np.testing.assert_array_equal(one.kd, CONFIG.leg.blind_damping)
+    np.testing.assert_array_equal([one.kp, one.dq], 0.0)
+    np.testing.assert_allclose(one.feedforward, 0.0, atol=1e-12)
     # The gait's clock has gone on, and so has the swing of the legs in the air.
     swinging = ~np.asarray(state.stance)
     np.testing.assert_allclose(np.asarray(state.swing.elapsed)[swinging], 0.031, atol=1e-12)
     # Joint rates that cannot be are no base for damping.
     _, nothing = act(tables, state, blind._replace(joint_vel=np.full((4, 3), np.nan)))
-    np.testing.assert_array_equal(nothing, 0.0)
+    np.testing.assert_array_equal(nothing.torque, 0.0)
 
 
 WILD = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -247,8 +252,8 @@ def test_state_and_command_stay_finite_whatever_comes_in(tables, calls, observat
     assert finite(state)
     state, _ = plan(tables, state, standing())
     state, _ = plan(tables, state, seen)
-    state, torque = act(tables, state, seen)
-    assert finite((state, torque))
+    state, joints = act(tables, state, seen)
+    assert finite((state, joints))
     state, _ = plan(tables, state, standing())
     assert finite(state)
 
@@ -269,7 +274,7 @@ def test_a_command_that_is_no_number_leaves_the_last_one(controller, tables, cal
     broken = with_params(
         tables,
         command=tables.params.command._replace(
-            velocities=jnp.full(5, jnp.nan, tables.params.height.dtype)
+            values=jnp.full((5, 6), jnp.nan, tables.params.height.dtype)
         ),
     )
     state, info = plan(broken, init(broken, standing()), standing())

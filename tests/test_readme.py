@@ -68,6 +68,7 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
         }
 
     def send_torque(torque):
+        assert isinstance(torque, np.ndarray | jax.Array)
         data.ctrl[at.actuator] = torque
         mujoco.mj_step(model, data)
         mujoco.mj_kinematics(model, data)
@@ -82,7 +83,7 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
             assert len(heights) == 1000
             assert 0.25 < min(heights) < max(heights) < 0.31
         exec(command, scope)
-    np.testing.assert_array_equal(scope["loop"].params.command.velocities, 0.3)
+    np.testing.assert_array_equal(scope["loop"].params.command.values[:, 0], 0.3)
     assert int(scope["info"].status) == 0
     assert int(scope["loop"].info.status) == 0
     # Both are the same controller.

@@ -31,16 +31,33 @@ from kjax.config.checks import (
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class CommandConfig:
-    """Forward velocity command: a step function of time."""
+    """What the robot is asked to do: step functions of time; a list left empty is zero."""
 
     times: tuple[NonNegative, ...] = (0.0, 6.0, 10.0, 14.0, 18.0)
     """Start of each piece, increasing, the first one 0 [s]."""
-    velocities: tuple[float, ...] = (0.0, 0.1, 0.3, 0.2, 0.0)
-    """Velocity that holds from each of those times on [m/s]."""
+    v_x: tuple[float, ...] = (0.0, 0.1, 0.3, 0.2, 0.0)
+    """Forward velocity from each of those times on [m/s]."""
+    v_y: tuple[float, ...] = ()
+    """Velocity to the left [m/s]."""
+    yaw_rate: tuple[float, ...] = ()
+    """To the left positive [rad/s]."""
+    height: tuple[float, ...] = ()
+    """Height of the centre of mass above the gait's own [m]."""
+    roll: tuple[float, ...] = ()
+    """Right side down positive [rad]."""
+    pitch: tuple[float, ...] = ()
+    """Nose up positive [rad]."""
 
     @model_validator(mode="after")
     def _check(self) -> "CommandConfig":
-        require_timeline(self.times, "velocities", self.velocities)
+        require_timeline(self.times, "v_x", self.v_x)
+        for name in ("v_y", "yaw_rate", "height", "roll", "pitch"):
+            values = getattr(self, name)
+            if values and len(values) != len(self.times):
+                raise ValueError(
+                    f"{name} must be empty or as long as times, got {len(values)} and "
+                    f"{len(self.times)}"
+                )
         return self
 
 
@@ -73,6 +90,8 @@ class LmpcConfig:
     """Reference height of the centre of mass above the ground under the stance feet [m]."""
     command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
     """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
+    height_slew: Positive = 0.2
+    """Largest rate at which the reference height follows the command [m/s]."""
     integral_gains: Annotated[tuple[NonNegative, NonNegative], RATE] = (0.0, 0.0)
     """Rates at which the errors of velocity and pitch move their references; 0: not [1/s]."""
     integral_limits: tuple[NonNegative, NonNegative] = (0.15, 0.15)

@@ -18,6 +18,7 @@ T = TypeVar("T")
 
 # What has become of keys of earlier versions.
 RETIRED = {
+    "command.velocities": "is now command.v_x",
     "lmpc.height_above": "is no key any more: heights are measured from the stance feet",
     "lateral.friction_offset": "is no key any more: lateral.friction bounds the horizontal force",
     "lateral.plan_friction": "is no key any more: lmpc.friction bounds the plan, lateral.friction "

@@ -22,7 +22,8 @@ class Episode(NamedTuple):
     Attributes:
       x: (T, 6) true state of the whole-body centre of mass [m, rad, m/s, rad/s].
       feet: (T, 4, 2) foot centres (x, z), world [m].
-      force: (T, 4, 2) planned force (x, z) on each leg for the tick, body frame [N].
+      force: (T, 4, 3) planned force (x, y, z) of each leg on the robot for the tick, axes of the
+        plane that x and z are in [N].
       stance: (T, 4) scheduled stance.
       foot_force: (T, 4) normal force on the contact sensors [N].
       disturbed: (T,) whether something else pushes the robot during the tick.
@@ -30,7 +31,7 @@ class Episode(NamedTuple):
 
     x: Float[np.ndarray, "T 6"]
     feet: Float[np.ndarray, "T 4 2"]
-    force: Float[np.ndarray, "T 4 2"]
+    force: Float[np.ndarray, "T 4 3"]
     stance: Bool[np.ndarray, "T 4"]
     foot_force: Float[np.ndarray, "T 4"]
     disturbed: Bool[np.ndarray, "T"]
@@ -146,7 +147,7 @@ def _of_episode(episode: Episode, number: int, dt: float, sole: float) -> Transi
     legs = stance.reshape(-1, 2, 2)
     ends = (np.asarray(episode.feet, float) - [0.0, sole]).reshape(-1, 2, 2, 2)
     ground = _mean_of(ends, np.where(legs.any(axis=2, keepdims=True), legs, True))
-    force = np.asarray(episode.force, float).reshape(-1, 2, 2, 2)
+    force = _in_body(np.asarray(episode.force, float), np.asarray(episode.x, float)[:, 2])
     before = np.concatenate([np.zeros_like(force[:1]), force[:-1]])
     touch = np.asarray(episode.foot_force) > TOUCH
     held, clear = (touch | ~stance).all(axis=1), (~touch | stance).all(axis=1)
@@ -184,6 +185,15 @@ def _modes(stance: Bool[np.ndarray, "T 4"]) -> Int[np.ndarray, "T"]:
         lost = stance[~same.any(axis=1)][0]
         raise ValueError(f"no contact mode has the legs {np.flatnonzero(lost).tolist()} in stance")
     return same.argmax(axis=1)
+
+
+def _in_body(
+    force: Float[np.ndarray, "T 4 3"], pitch: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T 2 2 2"]:
+    """Forces (x, z) of the legs by end, in the axes of the pitched body."""
+    c, s = np.cos(pitch)[:, None], np.sin(pitch)[:, None]
+    x, z = force[..., 0], force[..., 2]
+    return np.stack([c * x + s * z, c * z - s * x], axis=-1).reshape(-1, 2, 2, 2)
 
 
 def _mean_of(

@@ -39,15 +39,31 @@ class LegCommand(NamedTuple):
 
     Attributes:
       stance: (4,) legs that press.
-      force: (4, 2) with what force (x, z), body frame of the sagittal plane [N].
+      force: (4, 3) with what force on the robot, axes of the view [N].
       foot: (4, d) where the feet of the others shall be [m].
       foot_vel: (4, d) and how fast [m/s].
     """
 
     stance: Bool[Array, "4"]
-    force: Float[Array, "4 2"]
+    force: Float[Array, "4 3"]
     foot: Float[Array, "4 d"]
     foot_vel: Float[Array, "4 d"]
+
+
+class JointLoops(NamedTuple):
+    """What the legs ask of the joints, each (leg, joint).
+
+    Attributes:
+      torque: not yet within the robot's limits [N m].
+      q: angle that a leg in the air follows [rad].
+      dq: and its rate [rad/s].
+      follows: joints that follow them; the others press.
+    """
+
+    torque: Float[Array, "4 3"]
+    q: Float[Array, "4 3"]
+    dq: Float[Array, "4 3"]
+    follows: Bool[Array, "4 3"]
 
 
 class Footing(NamedTuple):
@@ -75,8 +91,8 @@ class Base(NamedTuple):
       view: (robot, track, observation) -> view.
       foothold: (robot, swing and lateral settings of the gait, view, footing) -> next footholds,
         foot centres (4, d), frame of the view [m].
-      torque: (robot, swing and lateral settings of the gait, view, command, observation) ->
-        joint torques (4, 3), not yet within the robot's limits [N m].
+      joints: (robot, swing and lateral settings of the gait, view, command, observation) -> what
+        the joints do about it.
     """
 
     track: Callable[[Observation], Any]
@@ -85,7 +101,7 @@ class Base(NamedTuple):
         [RobotParams, swing.SwingParams, lateral.LateralParams, View, Footing],
         Float[Array, "4 d"],
     ]
-    torque: Callable[
+    joints: Callable[
         [
             RobotParams,
             swing.SwingParams,
@@ -94,7 +110,7 @@ class Base(NamedTuple):
             LegCommand,
             Observation,
         ],
-        Float[Array, "4 3"],
+        JointLoops,
     ]
 
 
@@ -102,11 +118,16 @@ def build_base(kind: Literal["planar", "free"]) -> Base:
     """The functions of a base."""
     if kind == "planar":
         return Base(
-            track=_no_track, view=_planar_view, foothold=planar_foothold, torque=_planar_torque
+            track=_no_track, view=_planar_view, foothold=planar_foothold, joints=_planar_joints
         )
     return Base(
-        track=spatial.heading, view=_free_view, foothold=_free_foothold, torque=_free_torque
+        track=spatial.heading, view=_free_view, foothold=_free_foothold, joints=_free_joints
     )
+
+
+def to_local(view: View, vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Vectors of the heading frame in the axes of the view: the same on the planar base."""
+    return vectors if view.whole is None else spatial.turn(view.whole.heading, vectors)
 
 
 def _no_track(observation: Observation) -> None:
@@ -136,24 +157,31 @@ def planar_foothold(
     return jnp.stack([along, jnp.full_like(along, footing.ground + robot.foot_radius)], axis=-1)
 
 
-def _planar_torque(
+def _planar_joints(
     robot: RobotParams,
     settings: swing.SwingParams,
     sideways: lateral.LateralParams,
     view: View,
     command: LegCommand,
     observation: Observation,
-) -> Float[Array, "4 3"]:
+) -> JointLoops:
     """Thigh and calf press or swing; the abduction joints are held at zero."""
     body = view.planar
     angle, rate = swing.joint_reference(robot, body, command.foot, command.foot_vel)
     follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
-    press = stance_torque(robot, body.trig, command.force)
+    press = stance_torque(robot, body.trig, command.force[:, ::2] @ body.rotation)
     sagittal = jnp.where(command.stance[:, None], press, follow)
     abduction = (
         -settings.kp[0] * observation.joint_pos[:, 0] - settings.kd[0] * observation.joint_vel[:, 0]
     )
-    return jnp.concatenate([abduction[:, None], sagittal], axis=-1)
+    zero = jnp.zeros_like(abduction)[:, None]
+    in_air = ~command.stance[:, None]
+    return JointLoops(
+        torque=jnp.concatenate([abduction[:, None], sagittal], axis=-1),
+        q=jnp.concatenate([zero, angle], axis=-1),
+        dq=jnp.concatenate([zero, rate], axis=-1),
+        follows=jnp.concatenate([jnp.ones_like(in_air), in_air, in_air], axis=-1),
+    )
 
 
 def _free_view(robot: RobotParams, track: Float[Array, "2"], observation: Observation) -> View:
@@ -192,14 +220,14 @@ def _free_foothold(
     )
 
 
-def _free_torque(
+def _free_joints(
     robot: RobotParams,
     settings: swing.SwingParams,
     sideways: lateral.LateralParams,
     view: View,
     command: LegCommand,
     observation: Observation,
-) -> Float[Array, "4 3"]:
+) -> JointLoops:
     """All joints press with the regulated forces, or follow the path of a swing."""
     body = view.whole
     assert body is not None  # _free_view made it
@@ -212,5 +240,6 @@ def _free_torque(
     press = press * jnp.minimum(1.0, sideways.torque_fraction / jnp.maximum(load, 1e-6))
     # A sideways force has nothing to push against before the foot is down: keep the leg upright.
     loose = command.stance & ~observation.contact
-    press = press.at[:, 0].set(jnp.where(loose, follow[:, 0], press[:, 0]))
-    return jnp.where(command.stance[:, None], press, follow)
+    follows = jnp.broadcast_to(~command.stance[:, None], press.shape)
+    follows = follows.at[:, 0].set(~command.stance | loose)
+    return JointLoops(jnp.where(follows, follow, press), angle, rate, follows)

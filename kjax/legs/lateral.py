@@ -114,7 +114,7 @@ def stance_forces(
     robot: RobotParams,
     body: SpatialState,
     stance: Bool[Array, "4"],
-    planned: Float[Array, "4 2"],
+    planned: Float[Array, "4 3"],
 ) -> Float[Array, "4 3"]:
     """Forces (4, 3) on the robot, trunk axes [N]: the plan's, regulated in roll, yaw and y.
 
@@ -123,10 +123,9 @@ def stance_forces(
       robot: foot radius.
       body: the free robot.
       stance: (4,) legs on the ground.
-      planned: (4, 2) the LMPC's forces (x, z), body frame of the sagittal plane [N].
+      planned: (4, 3) the LMPC's forces on the robot, track frame [N].
     """
-    flat = planned @ body.planar.rotation.T
-    forces = jnp.stack([flat[:, 0], jnp.zeros_like(flat[:, 0]), flat[:, 1]], axis=-1)
+    forces = turn_back(body.heading, planned)
     below = jnp.stack([jnp.zeros_like(body.com[0])] * 2 + [robot.foot_radius])
     arms = turn_back(body.heading, body.feet - below - body.com)
     wrench = wrench_map(arms, stance) @ forces.reshape(-1)

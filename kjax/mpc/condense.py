@@ -14,18 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kjax.koopman.observables import STATE_ROWS
+from kjax.koopman.observables import STATE_START
 
 
 class CondensedQp(NamedTuple):
-    """Matrices of the condensed problem, k steps, N observables, 4 inputs.
+    """Matrices of the condensed problem: k steps, N observables, n_x states, n_u inputs.
 
     Attributes:
-      H: (4k, 4k) Hessian.
-      F: (4k, N) gradient per lifted initial state.
-      G: (4k, 6k) gradient per (negative) stacked reference.
-      A_qp: (6k, N) free response of the states.
-      B_qp: (6k, 4k) forced response of the states.
+      H: (n_u k, n_u k) Hessian.
+      F: (n_u k, N) gradient per lifted initial state.
+      G: (n_u k, n_x k) gradient per (negative) stacked reference.
+      A_qp: (n_x k, N) free response of the states.
+      B_qp: (n_x k, n_u k) forced response of the states.
     """
 
     H: Float[Array, "nu nu"]
@@ -37,9 +37,9 @@ class CondensedQp(NamedTuple):
 
 def condense(
     A: Float[Array, "N N"],
-    B: Float[Array, "N 4"],
-    state_weights: Float[Array, "6"] | Float[Array, "k 6"],
-    input_weights: Float[Array, "4"],
+    B: Float[Array, "N n_u"],
+    state_weights: Float[Array, "n_x"] | Float[Array, "k n_x"],
+    input_weights: Float[Array, "n_u"],
     horizon: int,
 ) -> CondensedQp:
     """Condensed QP of one linear model.
@@ -47,26 +47,28 @@ def condense(
     Args:
       A: lifted transition per model step.
       B: input map per model step.
-      state_weights: diagonal of Q, order of ``STATE_NAMES``; (6,), or (k, 6) for every step.
+      state_weights: diagonal of Q, the states being rows 1 to n_x of the lifted state; (n_x,), or
+        (k, n_x) for every step.
       input_weights: diagonal of R [1/N^2].
       horizon: number k of model steps, at least 1.
     """
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
-    m = B.shape[1]
+    n_x, n_u = state_weights.shape[-1], B.shape[1]
+    rows = slice(STATE_START, STATE_START + n_x)
     free, forced = [], []
     P = B  # A^i B
-    observe = A[STATE_ROWS]  # C_x A^(i+1)
+    observe = A[rows]  # C_x A^(i+1)
     for _ in range(horizon):
         free.append(observe)
-        forced.append(P[STATE_ROWS])
+        forced.append(P[rows])
         observe, P = observe @ A, A @ P
     # Block (i, j) of the block-Toeplitz B_qp is C_x A^(i-j) B.
     lag = np.subtract.outer(np.arange(horizon), np.arange(horizon))
     blocks = jnp.stack(forced)[np.maximum(lag, 0)] * (lag >= 0)[:, :, None, None]
-    B_qp = jnp.moveaxis(blocks, 1, 2).reshape(6 * horizon, m * horizon)
+    B_qp = jnp.moveaxis(blocks, 1, 2).reshape(n_x * horizon, n_u * horizon)
     A_qp = jnp.concatenate(free)
-    weights = jnp.broadcast_to(state_weights, (horizon, 6)).reshape(-1)
+    weights = jnp.broadcast_to(state_weights, (horizon, n_x)).reshape(-1)
     G = 2.0 * (B_qp * weights[:, None]).T
     H = G @ B_qp + 2.0 * jnp.diag(jnp.tile(input_weights, horizon))
     return CondensedQp(H=0.5 * (H + H.T), F=G @ A_qp, G=G, A_qp=A_qp, B_qp=B_qp)
@@ -74,11 +76,11 @@ def condense(
 
 def cautious_weights(
     A: Float[Array, "N N"],
-    state_weights: Float[Array, "6"],
-    spread: Float[Array, "6"],
+    state_weights: Float[Array, "n_x"],
+    spread: Float[Array, "n_x"],
     caution: Float[Array, ""] | float,
     horizon: int,
-) -> Float[Array, "k 6"]:
+) -> Float[Array, "k n_x"]:
     """Q of every step, less where the prediction is less certain.
 
     The error of one step, white and of standard deviation s, grows along the horizon to
@@ -91,14 +93,16 @@ def cautious_weights(
       caution: 0 to trust the whole horizon alike [-].
       horizon: number k of model steps.
     """
-    state = A[STATE_ROWS, STATE_ROWS]
+    n_x = state_weights.shape[0]
+    rows = slice(STATE_START, STATE_START + n_x)
+    state = A[rows, rows]
     step = jnp.diag(spread**2)
-    total, power, rows = jnp.zeros_like(step), jnp.eye(6, dtype=A.dtype), []
+    total, power, spreads = jnp.zeros_like(step), jnp.eye(n_x, dtype=A.dtype), []
     for _ in range(horizon):
         total = total + power @ step @ power.T
         power = state @ power
-        rows.append(jnp.diagonal(total))
-    variance = jnp.stack(rows)
+        spreads.append(jnp.diagonal(total))
+    variance = jnp.stack(spreads)
     mean = variance.mean(axis=0)
     ratio = jnp.where(mean > 0, variance / jnp.where(mean > 0, mean, 1.0), 0.0)
     return state_weights / (1.0 + caution * ratio)

@@ -19,19 +19,19 @@ from kjax.spec import ControllerSpec
 
 
 class LmpcTables(NamedTuple):
-    """Condensed problems, stacked over ``types.Mode`` (M modes, nu = 4 k variables).
+    """Condensed problems, stacked over ``types.Mode`` (M modes, nu = n_u k variables).
 
     Attributes:
       hessian: prepared Hessians, for the model's nominal contact points.
       F: (M, nu, N) linear term per lifted state.
-      G: (M, nu, 6k) linear term per (negative) reference.
+      G: (M, nu, n_x k) linear term per (negative) reference.
       q_input: (M, nu) constant linear term -2 R u_ref.
       lower: (M, nu) lower force bounds, body frame [N]; swing ends are fixed to 0.
       upper: (M, nu) upper force bounds [N].
       model: prediction models over one model_dt, for contact points measured on line.
-      spread: (M, 6) standard deviation of their error over one model_dt [m, rad, m/s, rad/s].
-      state_weights: (M, 6) diagonal of Q.
-      input_weights: (M, 4) diagonal of R [1/N^2].
+      spread: (M, n_x) standard deviation of their error over one model_dt [m, rad, m/s, rad/s].
+      state_weights: (M, n_x) diagonal of Q.
+      input_weights: (M, n_u) diagonal of R [1/N^2].
       uncertainty_discount: see ``condense.cautious_weights`` [-].
     """
 
@@ -42,9 +42,9 @@ class LmpcTables(NamedTuple):
     lower: Float[Array, "M nu"]
     upper: Float[Array, "M nu"]
     model: LinearModel
-    spread: Float[Array, "M 6"]
-    state_weights: Float[Array, "M 6"]
-    input_weights: Float[Array, "M 4"]
+    spread: Float[Array, "M n_x"]
+    state_weights: Float[Array, "M n_x"]
+    input_weights: Float[Array, "M n_u"]
     uncertainty_discount: Float[Array, ""]
 
 
@@ -52,7 +52,7 @@ class LmpcMemory(NamedTuple):
     """What the LMPC carries from tick to tick.
 
     Attributes:
-      plan: (4k,) last force plan, body frame [N].
+      plan: (n_u k,) last force plan, body frame [N].
       mode: contact mode that it was made in; -1 before the first.
       warm: where the QP of that mode may go on from; ``None`` where nothing is carried.
     """
@@ -66,18 +66,18 @@ class ModeSettings(NamedTuple):
     """Weights and bounds of every contact mode (M modes).
 
     Attributes:
-      state_weights: (M, 6) diagonal of Q.
-      input_weights: (M, 4) diagonal of R [1/N^2].
-      lower: (M, 4) lower force bounds, body frame [N].
-      upper: (M, 4) upper force bounds [N].
-      input_reference: (M, 4) forces that R penalises the distance from [N].
+      state_weights: (M, n_x) diagonal of Q.
+      input_weights: (M, n_u) diagonal of R [1/N^2].
+      lower: (M, n_u) lower force bounds, body frame [N].
+      upper: (M, n_u) upper force bounds [N].
+      input_reference: (M, n_u) forces that R penalises the distance from [N].
     """
 
-    state_weights: Float[Array, "M 6"]
-    input_weights: Float[Array, "M 4"]
-    lower: Float[Array, "M 4"]
-    upper: Float[Array, "M 4"]
-    input_reference: Float[Array, "M 4"]
+    state_weights: Float[Array, "M n_x"]
+    input_weights: Float[Array, "M n_u"]
+    lower: Float[Array, "M n_u"]
+    upper: Float[Array, "M n_u"]
+    input_reference: Float[Array, "M n_u"]
 
 
 def build_tables(
@@ -87,7 +87,7 @@ def build_tables(
     steps: int,
     horizon: int,
     feet: Float[Array, "M 2 2"],
-    spread: Float[Array, "M 6"] | None = None,
+    spread: Float[Array, "M n_x"] | None = None,
     discount: bool = False,
     uncertainty_discount: Float[Array, ""] | float = 0.0,
 ) -> LmpcTables:
@@ -99,7 +99,7 @@ def build_tables(
       steps: number of model steps that one step of the prediction holds.
       horizon: number k of prediction steps.
       feet: (M, 2, 2) nominal contact points [m].
-      spread: (M, 6) standard deviation of the one-step error of each model; ``None`` for none.
+      spread: (M, n_x) standard deviation of the one-step error of each model; ``None`` for none.
       discount: whether uncertain steps weigh less.
       uncertainty_discount: by how much, see ``condense.cautious_weights`` [-].
     """
@@ -134,33 +134,11 @@ def build_tables(
     )
 
 
-def reference_trajectory(
-    *,
-    position: Float[Array, ""],
-    velocity: Float[Array, ""],
-    height: Float[Array, ""],
-    periodic: Float[Array, "k 4"],
-    ahead: Float[Array, "k"],
-) -> Float[Array, "k 6"]:
-    """Reference (k, 6): constant velocity, and the gait's periodic motion about a height.
-
-    Args:
-      position: reference of p_x now [m].
-      velocity: commanded v_x [m/s].
-      height: mean of the centre of mass [m].
-      periodic: (k, 4) deviation of p_z, theta, v_z, omega; zeros for a level trunk.
-      ahead: (k,) time of each step from now [s].
-    """
-    z, theta, v_z, omega = periodic.T
-    forward = jnp.full_like(ahead, velocity)
-    return jnp.stack([position + velocity * ahead, height + z, theta, forward, v_z, omega], -1)
-
-
 class LmpcSolution(NamedTuple):
     """Result of ``solve_lmpc``.
 
     Attributes:
-      plan: (4k,) forces, four per step, body frame [N].
+      plan: (n_u k,) inputs, n_u per step, body frame [N].
       status: a ``qp.Status``.
       residual: relative, of the QP [-].
       iterations: of the solver.
@@ -189,7 +167,7 @@ def solve_lmpc(
     tables: LmpcTables,
     mode: Int[Array, ""],
     z: Float[Array, "N"],
-    reference: Float[Array, "k 6"],
+    reference: Float[Array, "k n_x"],
     memory: LmpcMemory,
     spec: ControllerSpec,
     model: LinearModel | None = None,
@@ -201,7 +179,7 @@ def solve_lmpc(
       tables: of all modes.
       mode: contact mode, an index; traced.
       z: lifted state, of the tables' models or of ``model``.
-      reference: (k, 6) states wanted.
+      reference: (k, n_x) states wanted.
       memory: of the last tick.
       spec: horizon and solver.
       model: over one model_dt and for the contact points as they are, in place of the tables' own.
@@ -261,7 +239,7 @@ def solve_lmpc(
 
 def shift_plan(plan: Float[Array, "nu"], spec: ControllerSpec) -> Float[Array, "nu"]:
     """The last plan one control tick later, its final step repeated: the next warm start."""
-    blocks = plan.reshape(spec.horizon, 4)
+    blocks = plan.reshape(spec.horizon, -1)
     steps = min(round(spec.control_dt / spec.model_dt), spec.horizon - 1)
     index = np.minimum(np.arange(spec.horizon) + steps, spec.horizon - 1)
     return blocks[index].reshape(-1)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from kjax.robots import go1
+from kjax.sim.episode import reference_height
 from kjax.sim.recording import Recording
 from kjax.tuning.loop import CostWeights, Trace, cost
 
@@ -19,8 +20,8 @@ def recording_costs(
     log, ticks = recording.log, len(recording.qpos)
     out = []
     for robot, config in enumerate(recording.configs):
-        height = np.where(log.gait[:, robot] == 1, config.bound.height, config.lmpc.height)
-        force = np.asarray(log.force[:, robot])
+        height = reference_height(log.gait[:, robot], recording.dt * np.arange(ticks), config)
+        force = np.asarray(log.force[:, robot])[..., ::2]
         trace = Trace(
             x=log.x[:, robot],
             wanted=np.stack([log.velocity_reference[:, robot], height], axis=1),  # type: ignore[arg-type]

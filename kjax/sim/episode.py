@@ -15,9 +15,11 @@ from kjax.config import (
     SimConfig,
 )
 from kjax.legs.base import build_base
+from kjax.resolve import build_command
 from kjax.robots import go1
 from kjax.sim import free_base
 from kjax.sim.observe import NOISE_DIM, Observe, noise_dim, noise_scale
+from kjax.types import COMMAND_NAMES
 from kjax.walkable import build_gaits
 
 FALL_HEIGHT = 0.12  # m, centre of mass; about the trunk lying on the ground
@@ -42,7 +44,8 @@ class Trajectory:
       torque: (N, 4, 3) joint torques commanded (abduction, thigh, calf) [N m].
       gait: (N,) index of the gait, order of ``controller.build_gaits``.
       stance: (N, 4) scheduled stance.
-      force: (N, 4, 2) planned force on each leg, body frame [N].
+      force: (N, 4, 3) planned force of each leg on the robot, world axes, turned by the heading
+        at the start [N].
       velocity_command: (N,) [m/s].
       velocity_reference: (N,) what the LMPC tracks: the command at a bounded rate [m/s].
       body_contact: (P,) whether anything but a foot touches the world at a control tick; from a
@@ -99,13 +102,23 @@ class Trajectory:
         return cls(**values)
 
 
-def reference_height(gait: Int[np.ndarray, "N"], config: RunConfig) -> Float[np.ndarray, "N"]:
-    """Reference height of the centre of mass above the ground in each gait [m]."""
+def reference_height(
+    gait: Int[np.ndarray, "N"], time: Float[np.ndarray, "N"], config: RunConfig
+) -> Float[np.ndarray, "N"]:
+    """Height of the centre of mass above the ground that is asked for [m].
+
+    Args:
+      gait: (N,) index of the gait.
+      time: (N,) since the start [s].
+      config: of the run.
+    """
     heights = [
         config.bound.height if one.name == "bound" else config.lmpc.height
         for one in build_gaits(config)
     ]
-    return np.array(heights)[gait]
+    command = build_command(config.command)
+    piece = np.searchsorted(command.times, time + 1e-9, side="right") - 1
+    return np.array(heights)[gait] + command.values[piece, COMMAND_NAMES.index("height")]
 
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
@@ -303,7 +316,7 @@ def _tracking(run: Trajectory, config: RunConfig) -> dict[str, Any]:
             "velocity_late_rmse_mps": float(np.sqrt(np.mean(error**2))),
         }
     if config.terrain.kind == "flat":
-        error = run.x[steady, 1] - reference_height(run.gait[steady], config)
+        error = run.x[steady, 1] - reference_height(run.gait[steady], run.time[steady], config)
         result |= {
             "height_error_max_m": float(np.abs(error).max()),
             "height_error_mean_m": float(abs(error.mean())),

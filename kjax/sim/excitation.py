@@ -39,15 +39,16 @@ def force_noise(config: RunConfig, ticks: int) -> Float[np.ndarray, "ticks 4"]:
 
 
 def perturb(
-    force: Float[Array, "4 2"], stance: Bool[Array, "4"], noise: Float[Array, "4"]
-) -> Float[Array, "4 2"]:
+    force: Float[Array, "4 3"], stance: Bool[Array, "4"], noise: Float[Array, "4"]
+) -> Float[Array, "4 3"]:
     """Forces on the legs with a random part; the ground still only pushes.
 
     Args:
-      force: planned (x, z) on each leg, body frame [N].
+      force: planned on each leg, local axes (``ControllerState``) [N].
       stance: legs that stand; the others get nothing.
       noise: added (x, z) at the front and the rear [N].
     """
-    added = force + jnp.repeat(noise.astype(force.dtype).reshape(2, 2), 2, axis=0)
-    added = added.at[:, 1].max(0.0)
+    noise = jnp.repeat(noise.astype(force.dtype).reshape(2, 2), 2, axis=0)
+    added = force.at[:, ::2].add(noise)
+    added = added.at[:, 2].max(0.0)
     return jnp.where(stance[:, None], added, force)

@@ -17,7 +17,7 @@ from jaxtyping import Array
 from kjax.config import RunConfig
 from kjax.controller import Controller, build_controller
 from kjax.params import Tables, condense, with_params
-from kjax.resolve import controller_key, resolve
+from kjax.resolve import build_command, controller_key, resolve
 from kjax.robots import go1
 from kjax.sim import free_base
 from kjax.sim.episode import (
@@ -62,7 +62,7 @@ class Requests(NamedTuple):
 
     Attributes:
       gait_times: (K,) when each gait is asked for [s].
-      command: forward velocity over time.
+      command: what is asked over time.
     """
 
     gait_times: Any
@@ -80,10 +80,7 @@ def requests(config: RunConfig) -> Requests:
     """What a config asks of the controller."""
     return Requests(
         gait_times=np.asarray(config.gait.times),
-        command=Command(
-            times=np.asarray(config.command.times),  # type: ignore[arg-type]
-            velocities=np.asarray(config.command.velocities),  # type: ignore[arg-type]
-        ),
+        command=build_command(config.command),
     )
 
 
@@ -160,22 +157,22 @@ def build_simulation(config: RunConfig) -> Simulation:
             ],
         )
 
-    def asked(requests: Requests) -> Tables:
+    def with_requests(requests: Requests) -> Tables:
         return with_params(tables, gait_times=requests.gait_times, command=requests.command)
 
     def begin(sensed: Array, wanted: Requests) -> LoopState:
         wanted = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), wanted)
-        return LoopState(controller.init(asked(wanted), sense(sensed)), wanted)
+        return LoopState(controller.init(with_requests(wanted), sense(sensed)), wanted)
 
     def plan_log(loop: LoopState, sensed: Array) -> tuple[LoopState, TickLog]:
-        state, info = controller.plan(asked(loop.requests), loop.controller, sense(sensed))
+        state, info = controller.plan(with_requests(loop.requests), loop.controller, sense(sensed))
         if excited:
             state = state._replace(force=perturb(state.force, state.stance, sensed[size:]))
         log = TickLog(
             gait=state.clock.gait,
             stance=state.stance,
             force=state.force,
-            velocity_command=state.velocity_command,
+            velocity_command=state.command[0],
             velocity_reference=state.velocity,
             status=info.status,
             residual=info.residual,
@@ -192,8 +189,10 @@ def build_simulation(config: RunConfig) -> Simulation:
 
     def act(flat: Array, sensed: Array) -> tuple[Array, Array]:
         loop = unpack(flat, state_like)
-        state, torque = controller.act(asked(loop.requests), loop.controller, sense(sensed))
-        return pack(loop._replace(controller=state)), torque.reshape(-1)
+        state, command = controller.act(
+            with_requests(loop.requests), loop.controller, sense(sensed)
+        )
+        return pack(loop._replace(controller=state)), command.torque.reshape(-1)
 
     dtype = tables.params.position_slack.dtype
     example = jax.ShapeDtypeStruct((size + 4 * excited,), dtype)

@@ -18,7 +18,7 @@ from kjax.config import (
     RunConfig,
 )
 from kjax.params import Tables, condense
-from kjax.resolve import controller_key, controller_spec, resolve
+from kjax.resolve import build_command, controller_key, controller_spec, resolve
 from kjax.robots import go1
 from kjax.sim.episode import origin
 from kjax.sim.excitation import force_deviation
@@ -188,16 +188,16 @@ def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]
     requests = max(len(config.gait.times) for config in configs)
     own: list[tuple[np.ndarray, ...]] = []
     for kind, config in zip(kinds, configs, strict=True):
-        gaits, command = built[kind].params.gaits, config.command
+        gaits, command = built[kind].params.gaits, build_command(config.command)
         own.append(
             (
                 _filled(command.times, pieces, np.inf).astype(dtype),
-                _filled(command.velocities, pieces, command.velocities[-1]).astype(dtype),
+                _filled(command.values, pieces, command.values[-1]).astype(dtype),
                 _filled(config.gait.times, requests, np.inf).astype(dtype),
                 _filled(gaits, requests, gaits[-1]).astype(np.int32),
             )
         )
-    times, velocities, gait_times, gait_names = map(np.stack, zip(*own, strict=True))
+    times, values, gait_times, gait_names = map(np.stack, zip(*own, strict=True))
 
     def hollow(tables: Tables, *fields: Any) -> Any:
         new = dict(zip(("command", "gait_times", "gaits"), fields, strict=True))
@@ -211,7 +211,7 @@ def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]
     axes = jax.tree.map(
         lambda *leaves: None if np.ndim(stack(*leaves)) == np.ndim(leaves[0]) else 0, *shared
     )
-    commands = Command(times, velocities)  # type: ignore[arg-type]
+    commands = Command(times, values)  # type: ignore[arg-type]
     stacked = hollow(jax.tree.map(stack, *shared), commands, gait_times, gait_names)
     own_axes = hollow(axes, Command(0, 0), 0, 0)  # type: ignore[arg-type]
     return jax.tree.map(jnp.asarray, stacked), own_axes
@@ -220,7 +220,8 @@ def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]
 def _filled(values: Any, count: int, rest: Any) -> np.ndarray:
     """Values, filled up to ``count`` of them."""
     values = np.asarray(values, float)
-    return np.concatenate([values, np.full(count - len(values), float(rest))])
+    more = np.broadcast_to(np.asarray(rest, float), (count - len(values), *values.shape[1:]))
+    return np.concatenate([values, more])
 
 
 def check_engine(config: RunConfig, *, engine: str = "c", torques: str = "every_step") -> None:

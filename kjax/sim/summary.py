@@ -51,9 +51,9 @@ def tracking_floor(
       start: of the measured window [s].
     """
     times = [*command.times, end]
-    velocity = command.velocities[0]  # the window begins after the first piece has
+    velocity = command.v_x[0]  # the window begins after the first piece has
     total = 0.0
-    for wanted, begin, until in zip(command.velocities, times[:-1], times[1:], strict=True):
+    for wanted, begin, until in zip(command.v_x, times[:-1], times[1:], strict=True):
         error = wanted - velocity
         low, high = (_left(abs(error), acceleration, t - begin) for t in (max(begin, start), until))
         if min(until, end) > max(begin, start):

@@ -140,7 +140,7 @@ def build_walk(
             gait=moved.clock.gait,
             stance=moved.stance,
             force=moved.force,
-            velocity_command=moved.velocity_command,
+            velocity_command=moved.command[0],
             velocity_reference=moved.velocity,
             status=info.status,
             residual=info.residual,
@@ -151,8 +151,8 @@ def build_walk(
     def act(
         tables: Tables, episode: EpisodeParams, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, Array]:
-        moved, torque = controller.act(tables, state.controller, sense(episode, step, sensed))
-        torque = jnp.where(state.alive, torque, 0.0)
+        moved, command = controller.act(tables, state.controller, sense(episode, step, sensed))
+        torque = jnp.where(state.alive, command.torque, 0.0)
         return state._replace(controller=moved), torque.reshape(-1)[order]
 
     return Walk(init=init, plan=plan, act=act)

@@ -31,7 +31,7 @@ from kjax.robots import go1
 from kjax.state import ControllerState
 from kjax.tuning import plant as body_plant
 from kjax.tuning.plant import PlantParams
-from kjax.types import GRAVITY, STATE_DIM, Command, RobotParams
+from kjax.types import COMMAND_NAMES, GRAVITY, STATE_DIM, Command, RobotParams
 
 # A body beyond these has fallen: what it does then is of no interest, and it is held still.
 MAX_PITCH = 1.0  # rad
@@ -42,7 +42,7 @@ class Scenario(NamedTuple):
     """What a run meets; a leading axis makes a batch of them.
 
     Attributes:
-      command: velocity over time.
+      command: what is asked over time.
       x: (6,) start of the body [m, rad, m/s, rad/s].
       plant: its numbers.
       noise: (6,) standard deviation of what is measured of x [m, rad, m/s, rad/s].
@@ -150,14 +150,15 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             turns = (number > 0) & carry.alive
             x = x.at[5].add(jnp.where(turns, carry.spin - spin, 0.0) / plant.inertia)
             before = carry.force * state.stance[:, None]
-            pressed, reached = body_plant.follow(plant, before, state.force, dt)
+            planned = state.force[:, ::2] @ seen.planar.rotation
+            pressed, reached = body_plant.follow(plant, before, planned, dt)
             force = body_plant.feasible(robot, plant, true, pressed)
             sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
             moved = body_plant.advance(plant, state.stance, x, feet - sole, force, dt)
             alive = carry.alive & _upright(moved)
             record = Trace(
                 x=x,
-                wanted=jnp.stack([state.velocity, params.height[state.clock.gait]]),
+                wanted=jnp.stack([state.velocity, params.height[state.clock.gait] + state.height]),
                 feet=feet,
                 stance=state.stance,
                 mode=info.mode,
@@ -349,7 +350,7 @@ def draw_scenarios(
     drawn = Scenario(
         command=Command(
             times=np.broadcast_to(times, (count, pieces)),  # type: ignore[arg-type]
-            velocities=rng.uniform(*speeds, (count, pieces)),  # type: ignore[arg-type]
+            values=_forward(rng.uniform(*speeds, (count, pieces))),  # type: ignore[arg-type]
         ),
         x=x,
         plant=plants,
@@ -360,6 +361,11 @@ def draw_scenarios(
     return jax.tree.map(
         lambda a: jnp.asarray(a, dtype if jnp.asarray(a).dtype != jnp.uint32 else None), drawn
     )
+
+
+def _forward(speeds: np.ndarray) -> np.ndarray:
+    """Values (..., 6) of commands that ask for a forward velocity only [m/s]."""
+    return speeds[..., None] * (np.arange(len(COMMAND_NAMES)) == COMMAND_NAMES.index("v_x"))
 
 
 def _silent() -> NoiseConfig:

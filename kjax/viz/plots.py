@@ -66,7 +66,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
             pitch.legend(ncol=3, loc="upper left")
 
         height.plot(t, run.x[:, 1], color=BLUE)
-        height.plot(t, reference_height(run.gait, config), ls="--", color=DARK, lw=0.9)
+        height.plot(t, reference_height(run.gait, t, config), ls="--", color=DARK, lw=0.9)
         height.set_ylabel("CoM height [m]")
 
         for axis in (velocity, pitch, height):
@@ -100,7 +100,7 @@ def stride_time(gait: np.ndarray, config: RunConfig) -> float:
 
 def zoom_window(end: float, config: RunConfig) -> tuple[float, float]:
     """Two seconds about the largest step of the command, or the last two [s]."""
-    times, velocities = config.command.times, config.command.velocities
+    times, velocities = config.command.times, config.command.v_x
     steps = [
         (abs(b - a), t)
         for t, a, b in zip(times[1:], velocities, velocities[1:], strict=False)
@@ -113,7 +113,7 @@ def zoom_window(end: float, config: RunConfig) -> tuple[float, float]:
 
 def _forces(axis: Axes, run: Trajectory, part: np.ndarray) -> None:
     for leg in Leg:
-        axis.plot(run.time[part], run.force[part, leg, 1], color=_LEG_COLOURS[leg], label=leg.name)
+        axis.plot(run.time[part], run.force[part, leg, 2], color=_LEG_COLOURS[leg], label=leg.name)
         axis.plot(run.time[part], run.force[part, leg, 0], ":", color=_LEG_COLOURS[leg])
     axis.set_ylabel("planned force [N]\nF_z, dotted F_x")
     axis.legend(ncol=4, loc="upper right")

@@ -192,7 +192,7 @@ values = [0.1, 0.3]
 unit = "m/s"
 [set]
 "command.times" = [0.0]
-"command.velocities" = ["= speed"]
+"command.v_x" = ["= speed"]
 [figure]
 metrics = ["success"]
 title = "one"

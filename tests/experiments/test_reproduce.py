@@ -205,7 +205,7 @@ def test_the_speed_that_was_reached_stands_beside_the_one_that_passes(experiment
     """A robot that walks 15 % too slowly up to 1 m/s, and stays at 0.85 m/s."""
 
     def answer(config):
-        wanted = config.command.velocities[-1]
+        wanted = config.command.v_x[-1]
         return {"fell": False, "velocity_late_mean_mps": min(0.85 * wanted, 0.85)}
 
     one = search(experiments, "speed_trot", answer)
@@ -244,7 +244,7 @@ def test_the_figure_shows_maps_and_speeds(experiments, tmp_path):
         "a": search(experiments, "push_bound", lambda c: {"fell": c.push.forward > 20.0}),
         "b": search(experiments, "speed_trot", lambda c: {"fell": True}),
         "c": search(experiments, "speed_bound", lambda c: {
-            "fell": False, "velocity_late_mean_mps": c.command.velocities[-1]}),
+            "fell": False, "velocity_late_mean_mps": c.command.v_x[-1]}),
     }  # fmt: skip
     envelope_figure(found, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 5000

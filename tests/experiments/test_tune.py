@@ -30,7 +30,7 @@ def tune(repository):
 SMALL = (
     "configs/trot_velocity_long.toml", "--seconds", "0.2", "--scenarios", "2", "--held-out", "2",
     "--updates", "5", "--worsen", "3", "--seeds", "2", "--duration", "0.6",
-    "--command.times", "[0.0]", "--command.velocities", "[0.2]",
+    "--command.times", "[0.0]", "--command.v_x", "[0.2]",
 )  # fmt: skip
 
 

@@ -49,7 +49,7 @@ def walk(seed, body, W, *, phases=4, lost=()):
     x = np.zeros((ticks, 6))
     x[0] = [seed, 0.27, *0.1 * rng.normal(size=4)]
     feet = np.zeros((ticks, 4, 2))
-    force = np.zeros((ticks, 4, 2))
+    force = np.zeros((ticks, 4, 3))
     step = stepper(body, W)
     for t in range(ticks):
         moved = t % PHASE == 0
@@ -59,7 +59,9 @@ def walk(seed, body, W, *, phases=4, lost=()):
         if moved and t > 0:  # feet that lift do so after the sample that ends their last tick
             feet[t] = np.where(stance[t, :, None], fresh, feet[t - 1])
         ends = np.array([0.0, 62.0]) + 20.0 * rng.normal(size=(2, 2))
-        force[t] = np.where(stance[t, :, None], np.repeat(ends, 2, axis=0), 0.0)
+        c, s = np.cos(x[t, 2]), np.sin(x[t, 2])
+        world = ends @ np.array([[c, -s], [s, c]]).T  # the body's model takes them in its axes
+        force[t, :, ::2] = np.where(stance[t, :, None], np.repeat(world, 2, axis=0), 0.0)
         front, rear = (feet[t, legs][stance[t, legs]][0] for legs in (slice(0, 2), slice(2, 4)))
         ground = np.stack([front, rear]) - [0.0, SOLE]
         if t + 1 < ticks:
@@ -169,9 +171,11 @@ def test_place_in_the_gait_and_forces_are_those_of_the_schedule(data, episodes):
     np.testing.assert_array_equal(np.flatnonzero(one.new), PHASE * np.arange(4))
     # all rows, but those in which the sensors still show the feet before
     np.testing.assert_array_equal(np.flatnonzero(~one.planted), PHASE * np.arange(1, 4))
-    force = episodes[3].force
-    np.testing.assert_allclose(one.u[0], force[0, [0, 3]].reshape(4))
-    np.testing.assert_allclose(one.u[PHASE], force[PHASE, [1, 2]].reshape(4))
+    force = episodes[3].force[..., ::2]
+    for tick, legs in ((0, [0, 3]), (PHASE, [1, 2])):
+        c, s = np.cos(one.x[tick, 2]), np.sin(one.x[tick, 2])
+        body = force[tick, legs] @ np.array([[c, -s], [s, c]])
+        np.testing.assert_allclose(one.u[tick], body.reshape(4))
     np.testing.assert_allclose(one.u_before[PHASE + 1], one.u[PHASE])
     assert not one.u_before[PHASE].any()  # these legs were in the air
     np.testing.assert_allclose(one.x_next[:-1], one.x[1:])
@@ -210,7 +214,7 @@ def test_an_idle_end_gets_no_weight(body):
     episode = Episode(
         x=0.1 * rng.normal(size=(ticks, 6)),
         feet=feet,
-        force=np.where(front[..., None], rng.normal(size=(ticks, 4, 2)), 7.0),
+        force=np.where(front[..., None], rng.normal(size=(ticks, 4, 3)), 7.0),
         stance=front,
         foot_force=60.0 * front,
         disturbed=np.zeros(ticks, bool),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax import srb
+from kjax import planning, srb
 from kjax.config import BoundConfig, LmpcConfig
 from kjax.koopman import models, observables
 from kjax.legs.kinematics import LegTrig, leg_trig
@@ -49,7 +49,7 @@ FREE_SPEC = dataclasses.replace(SPEC, tolerance=1e-11)
 AHEAD = 0.005 * np.arange(1, 5)  # s
 
 lift = jax.jit(observables.paper(4).lift)
-reference_trajectory = jax.jit(lmpc.reference_trajectory)
+reference_trajectory = jax.jit(planning.reference_trajectory)
 condense_all = jax.jit(lmpc.build_tables, static_argnames=("steps", "horizon"))
 solve = jax.jit(lmpc.solve_lmpc, static_argnames="spec")
 

@@ -25,7 +25,7 @@ COMMON = {
 }
 OWN = (
     {},
-    {"command.velocities": [0.3, 0.3, 0.3, 0.3, 0.3], "terrain.seed": 3},
+    {"command.v_x": [0.3, 0.3, 0.3, 0.3, 0.3], "terrain.seed": 3},
     {"push.times": [0.1], "push.forward": 4.0, "sim.friction": 0.6, "terrain.height_max": 0.09},
     {"sim.payload": 2.0, "sim.delay": 0.005, "lmpc.height": 0.25},
     {"noise.position": 0.0, "seed": 7},

@@ -15,7 +15,7 @@ SHORT = {
     "sim.base": "planar",
     "duration": 1.5,
     "command.times": [0.0, 0.5],
-    "command.velocities": [0.0, 0.2],
+    "command.v_x": [0.0, 0.2],
     "lmpc.command_slew": np.inf,
 }
 
@@ -38,6 +38,16 @@ def test_it_trots_at_the_commanded_speed_without_falling(run, simulation):
     assert result["velocity_rmse_mps"] < 0.04
     assert np.mean(run.x[-500:, 3]) == pytest.approx(0.2, abs=0.02)
     assert result["pitch_max_deg"] < 3.0
+
+
+@pytest.mark.parametrize("height", [-0.03, 0.02])
+def test_it_walks_as_high_above_its_gaits_height_as_it_is_asked_to(simulation, run, height):
+    config = load_config(RunConfig, None, SHORT | {"command.height": [0.0, height]})
+    other = simulate(simulation, config, seed=0)
+    np.testing.assert_array_equal(other.x[:500], run.x[:500])
+    moved = np.mean(other.x[-500:, 1] - run.x[-500:, 1])
+    assert moved == pytest.approx(height, abs=1e-3)
+    assert metrics(other, config)["pitch_max_deg"] < 3.0
 
 
 FEET_ONLY = {"ground", "FR_foot", "FL_foot", "RR_foot", "RL_foot"}
@@ -156,7 +166,7 @@ def test_slip_of_a_rolling_foot_is_zero_and_of_a_dragged_one_its_path():
     assert foot_slip(dragged, 1e-3, 5.0) == pytest.approx(0.01, abs=1e-12)
 
 
-IN_PLACE = {"sim.base": "planar", "command.times": [0.0], "command.velocities": [0.0]}
+IN_PLACE = {"sim.base": "planar", "command.times": [0.0], "command.v_x": [0.0]}
 
 
 @pytest.fixture(scope="module")

@@ -27,12 +27,12 @@ def config(**keys):
 
 
 def test_standing_legs_of_an_end_get_the_same_and_none_is_pulled_down(dtype):
-    force = jnp.asarray([[1.0, 60.0], [2.0, 50.0], [3.0, 4.0], [4.0, 0.0]], dtype)
+    force = jnp.asarray([[1, 5, 60], [2, 5, 50], [3, 5, 4], [4, 5, 0]], dtype)
     stance = jnp.asarray([True, False, True, False])
     noise = jnp.asarray([3.0, -7.0, -5.0, -9.0])
     got = perturb(force, stance, noise)
     assert got.dtype == dtype
-    np.testing.assert_allclose(got, [[4.0, 53.0], [2.0, 50.0], [-2.0, 0.0], [4.0, 0.0]])
+    np.testing.assert_allclose(got, [[4, 5, 53], [2, 5, 50], [-2, 5, 0], [4, 5, 0]])
     np.testing.assert_array_equal(perturb(force, stance, jnp.zeros(4)), force)
 
 

@@ -20,7 +20,7 @@ PER_TICK, TICKS = 5, 60
 
 @pytest.fixture(scope="module")
 def config():
-    walk = {"duration": 1.5, "command.times": [0.0, 0.5], "command.velocities": [0.0, 0.2]}
+    walk = {"duration": 1.5, "command.times": [0.0, 0.5], "command.v_x": [0.0, 0.2]}
     return load_config(RunConfig, None, FREE | walk)
 
 

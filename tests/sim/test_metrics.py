@@ -15,7 +15,7 @@ SWITCH = {"gait.names": ["trot", "bound"], "gait.times": [0.0, 1.0]}
     [
         ({}, 3.0),
         ({"duration": 0.3}, 0.3),
-        ({"command.times": [0.0], "command.velocities": [0.1]}, 3.0),
+        ({"command.times": [0.0], "command.v_x": [0.1]}, 3.0),
         ({"sim.base": "free"}, 3.0),
         ({"terrain.kind": "paper"}, 3.0),
         (SWITCH, 3.0),

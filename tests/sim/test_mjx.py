@@ -24,7 +24,7 @@ COMMON = {
 # A robot each of its own field, friction, payload, delay, push and command; the last one falls.
 OWN = (
     {"terrain.seed": 1},
-    {"command.velocities": [0.3] * 5, "sim.friction": 0.5, "sim.payload": 1.0},
+    {"command.v_x": [0.3] * 5, "sim.friction": 0.5, "sim.payload": 1.0},
     {"push.times": [0.1], "push.forward": 2.0, "sim.delay": 0.002},
     {"push.times": [0.0], "push.forward": 120.0},
 )

@@ -55,7 +55,7 @@ def test_a_push_speeds_the_walking_robot_up_and_it_walks_on():
         "sim.base": "planar",
         "duration": 1.6,
         "command.times": [0.0],
-        "command.velocities": [0.0],
+        "command.v_x": [0.0],
     }
     chosen |= {"noise.enabled": False}
     calm = load_config(RunConfig, None, chosen)

@@ -139,8 +139,8 @@ def test_parameters_of_a_batch_are_those_of_its_robots():
     configs = [
         load_config(RunConfig, None, overrides)
         for overrides in (
-            {"command.times": [0.0], "command.velocities": [0.4]},
-            {"lmpc.height": 0.25, "command.times": [0.0, 1.0], "command.velocities": [0.1, 0.2]},
+            {"command.times": [0.0], "command.v_x": [0.4]},
+            {"lmpc.height": 0.25, "command.times": [0.0, 1.0], "command.v_x": [0.1, 0.2]},
             {"gait.names": ["trot", "bound"], "gait.times": [0.0, 2.0]},
         )
     ]

@@ -15,7 +15,7 @@ from kjax.sim.mujoco_loop import build_simulation, requests, simulate
 WALK = {
     "duration": 1.2,
     "command.times": [0.0, 0.3],
-    "command.velocities": [0.0, 0.3],
+    "command.v_x": [0.0, 0.3],
     "sim.contacts": "feet",
 }
 PLACES = [(0.0, 0.0), (10.0, 3.0), (1e3, -0.27), (1e4, -2.0)]  # m: start, floor
@@ -60,7 +60,7 @@ def test_it_walks_up_and_down_a_slope(slope):
     keys = {
         "duration": 10.0,
         "command.times": [0.0, 1.0],
-        "command.velocities": [0.0, 0.3],
+        "command.v_x": [0.0, 0.3],
         "terrain.kind": "slope",
         "terrain.slope": slope,
         "terrain.start": 0.5,
@@ -79,7 +79,7 @@ def test_it_walks_up_and_down_a_slope(slope):
 
 @pytest.fixture(scope="module")
 def simulation():
-    keys = {"command.times": [0.0, 0.5], "command.velocities": [0.0, 0.3], "sim.base": "planar"}
+    keys = {"command.times": [0.0, 0.5], "command.v_x": [0.0, 0.3], "sim.base": "planar"}
     return build_simulation(load_config(RunConfig, None, keys))
 
 

@@ -148,7 +148,7 @@ def test_heights_follow_the_ground_under_the_stance_feet():
     common = {
         "duration": 1.0,
         "command.times": [0.0],
-        "command.velocities": [0.0],
+        "command.v_x": [0.0],
         "terrain.kind": "steps",
         "terrain.count": 1,
         "terrain.start": 0.001,

@@ -18,14 +18,14 @@ low = 0.1
 high = 0.3
 count = 3
 [set]
-"command.velocities" = [0.0, "= speed"]
+"command.v_x" = [0.0, "= speed"]
 "bound.front_stance" = "= duty * 0.4 / 2 + 0.05"
 """
 
 
 @pytest.fixture
 def file(tmp_path):
-    (tmp_path / "walk.toml").write_text("[command]\ntimes = [0.0, 1.0]\nvelocities = [0.0, 0.0]\n")
+    (tmp_path / "walk.toml").write_text("[command]\ntimes = [0.0, 1.0]\nv_x = [0.0, 0.0]\n")
     path = tmp_path / "sweep.toml"
     path.write_text(SWEEP)
     return path
@@ -39,7 +39,7 @@ def test_a_grid_is_every_value_with_every_other_and_every_seed(file):
     at = np.empty(12, object)
     at[:] = cases.cases
     one = at.reshape(cases.shape)[1, 2, 1]
-    assert one.command.velocities == (0.0, 0.4)
+    assert one.command.v_x == (0.0, 0.4)
     assert one.bound.front_stance == pytest.approx(0.11, abs=1e-12)
     assert (one.seed, one.terrain.seed) == (6, 6)
     dims, values, unit = cases.coords["duty"]
@@ -58,7 +58,7 @@ def test_a_sample_is_drawn_from_the_ranges_and_again_the_same(file):
     cases, again = plan(sweep, file), plan(sweep, file)
     assert cases.cases == again.cases
     assert cases.dims == ("sample", "seed")
-    speeds = [case.command.velocities[1] for case in cases.cases]
+    speeds = [case.command.v_x[1] for case in cases.cases]
     np.testing.assert_array_equal(speeds, cases.coords["speed"][1])
     assert 0.2 <= min(speeds) < 0.23
     assert 0.37 < max(speeds) <= 0.4
@@ -67,11 +67,11 @@ def test_a_sample_is_drawn_from_the_ranges_and_again_the_same(file):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('"= speed"', '"= sped"', r"set\.command\.velocities: no axis named 'sped'"),
+        ('"= speed"', '"= sped"', r"set\.command\.v_x: no axis named 'sped'"),
         ('"= speed"', '"= __import__(1)"', r"wanted numbers, axes and"),
         ('"= speed"', '"= speed +"', r"wanted numbers, axes and"),
-        ('"= speed"', '"fast"', r"at speed = 0\.2.*command\.velocities"),
-        ('"command.velocities"', '"command.velocity"', r"command\.velocity: unknown key"),
+        ('"= speed"', '"fast"', r"at speed = 0\.2.*command\.v_x"),
+        ('"command.v_x"', '"command.velocity"', r"command\.velocity: unknown key"),
         (
             "duty * 0.4",
             "0.4 / (duty - 0.1)",

@@ -31,7 +31,7 @@ unit = "m/s"
 "sim.contacts" = "feet"
 "duration" = 0.8
 "command.times" = [0.0]
-"command.velocities" = ["= speed"]
+"command.v_x" = ["= speed"]
 """
 
 
@@ -54,7 +54,7 @@ def calls(monkeypatch):
                 raise KeyboardInterrupt
             log.chunks.append([config.seed for config in configs])
             rows = [
-                {"fell": config.seed == 3, "velocity_rmse_mps": config.command.velocities[0]}
+                {"fell": config.seed == 3, "velocity_rmse_mps": config.command.v_x[0]}
                 | ({} if config.seed == 3 else {"pitch_max_deg": float(config.seed)})
                 for config in configs
             ]

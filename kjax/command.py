@@ -1,0 +1,32 @@
+"""What of a command the planar controller follows; the rest is refused, or told while it runs."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from kjax.types import COMMAND_NAMES
+
+FOLLOWED = ("v_x", "height")
+V_X, HEIGHT = map(COMMAND_NAMES.index, FOLLOWED)
+# Columns that have no effect.
+IGNORED = np.array([name not in FOLLOWED for name in COMMAND_NAMES])
+
+
+def check_command(columns: Mapping[str, Sequence[float]]) -> None:
+    """Refuse a command that the planar controller does not follow.
+
+    Args:
+      columns: values by name of the column.
+
+    Raises:
+      ValueError: naming the column, for a value that is not finite, and for one other than 0 where
+        the controller follows none.
+    """
+    for name, values in columns.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"command.{name}: got {list(values)}, wanted finite numbers")
+        if name not in FOLLOWED and np.any(values):
+            raise ValueError(
+                f"command.{name}: got {list(values)}, but the planar controller follows "
+                f"{' and '.join(FOLLOWED)} only; leave it at 0"
+            )
