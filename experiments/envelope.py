@@ -97,7 +97,9 @@ def _steady(speed: float, duration: float) -> dict[str, Any]:
 
 
 _TROT, _BOUND = "trot_velocity.toml", "bound_multiphase.toml"
-_FLYING = {"gait.trot_flight": 0.05, "gait.stance_time": 0.15}
+# Stances of 150 ms, flights of 50.
+_FLYING = {"gait.names": ["flying_trot"], "gaits.flying_trot.period": 0.4,
+           "gaits.flying_trot.duty": [0.375] * 4}  # fmt: skip
 _BLOCKS = {"terrain.kind": "blocks", "terrain.count": 5}
 AXES = (
     Axis(name="speed_trot", title="trot", quantity="fastest", unit="m/s", config=_TROT,

@@ -33,10 +33,15 @@ CASES: dict[str, dict[str, Any]] = {name: {} for name in _FILES} | {
     "bound, friction as rows": {"lmpc.friction": 0.6},
 }  # fmt: skip
 LMPC = ("lmpc.state_weights", "lmpc.input_weight", "lmpc.force_x_max", "lmpc.height")
-BOUND = ("bound.state_weights", "bound.input_weight", "bound.feet_front", "bound.force_edge",
-         "bound.force_z_max", "bound.velocity_gain")  # fmt: skip
-CYCLE = ("multiphase.state_weights", "multiphase.input_weight", "multiphase.inertia_scale",
-         "multiphase.velocity_time", "bound.feet_front", "bound.velocity_gain")  # fmt: skip
+BOUND = tuple(
+    f"gaits.bound.{key}" for key in ("state_weights", "input_weight", "feet_front", "force_edge",
+                                     "force_z_max", "velocity_gain")
+)  # fmt: skip
+CYCLE = (
+    *(f"gaits.bound_multiphase.{key}"
+      for key in ("state_weights", "input_weight", "feet_front", "velocity_gain")),
+    "multiphase.inertia_scale", "multiphase.velocity_time",
+)  # fmt: skip
 KEYS = {
     "trot": (*LMPC, "leg.velocity_gain"),
     "trot, planted model, measured feet": (

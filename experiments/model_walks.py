@@ -18,7 +18,7 @@ import numpy as np
 from prediction_models import MODELS, residual
 
 from kjax import cli
-from kjax.config import RunConfig, load_config
+from kjax.config import Gaits, RunConfig, load_config
 from kjax.episodes import code_version, config_hash
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -123,7 +123,7 @@ class Study(NamedTuple):
 def candidates(study: Study) -> list[RunConfig]:
     """Configs with each set of weights; the first one has the config's own."""
     base = config_of(study.gait, study.keys)
-    return [scaled(base, study.gait, row) for row in weight_scales(study.sizes[0])]
+    return [scaled(base, row) for row in weight_scales(study.sizes[0])]
 
 
 def identity(study: Study) -> str:
@@ -162,14 +162,18 @@ def weight_scales(sets: int) -> np.ndarray:
     return scales
 
 
-def scaled(config: RunConfig, gait: str, row: np.ndarray) -> RunConfig:
-    """The config with its weights times these factors."""
-    part = config.lmpc if gait == "trot" else config.bound
+def scaled(config: RunConfig, row: np.ndarray) -> RunConfig:
+    """The config with its gait's weights times these factors."""
+    name = config.gait.names[0]
+    own = config.gaits[name].state_weights is not None
+    part: Any = config.gaits[name] if own else config.lmpc
     weights = tuple(float(w * f) for w, f in zip(part.state_weights, row[:6], strict=True))
     part = dataclasses.replace(
         part, state_weights=weights, input_weight=float(part.input_weight * row[6])
     )
-    return dataclasses.replace(config, **{"lmpc" if gait == "trot" else "bound": part})
+    if own:
+        return dataclasses.replace(config, gaits=Gaits({**config.gaits, name: part}))
+    return dataclasses.replace(config, lmpc=part)
 
 
 def config_of(gait: str, keys: dict[str, Any]) -> RunConfig:

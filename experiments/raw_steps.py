@@ -149,7 +149,7 @@ def steps_of(case: Case, start: float, args: Namespace) -> Iterator[tuple[float,
         CONFIGS / GAITS[case.gait],
         {"sim.base": case.base, "lmpc.command_slew": inf, **FORCES[case.forces]},
     )
-    cycle = 2.0 * base.gait.stance_time
+    cycle = base.gaits[base.gait.names[0]].period
     duration = earliest + cycle + (0.2 if args.quick else AFTER)
     for value in values:
         configs = []

@@ -32,12 +32,8 @@ from kjax.sim.closed_cost import recording_costs
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.tuning.optimise import build_objective, check_checkpoint, descend
-from kjax.tuning.space import TUNABLE, Space, Variables, build_space, tuned_config
+from kjax.tuning.space import TUNABLE, Space, Variables, build_space, shown, tuned_config
 
-KEYS = {
-    "trot": ("lmpc.state_weights", "lmpc.input_weight"),
-    "bound": ("bound.state_weights", "bound.input_weight", "bound.velocity_gain"),
-}
 TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
 POPULATION_SEEDS = 4  # MuJoCo episodes per candidate of the baseline
 SIGMA = 0.5  # of a first population, about a factor of 1.6
@@ -143,7 +139,7 @@ def _parse() -> tuple[RunConfig, Namespace]:
         "--keys",
         nargs="+",
         metavar="KEY",
-        help=f"what to tune; the gait's weights by default; of: {', '.join(TUNABLE)}",
+        help=f"what to tune; the gait's weights by default; of: {', '.join(shown(TUNABLE))}",
     )
     parser.add_argument("--scenarios", type=int, default=16, help="to descend on")
     parser.add_argument("--held-out", type=int, default=32, help="to choose the best point on")
@@ -186,12 +182,21 @@ def _parse() -> tuple[RunConfig, Namespace]:
             cli.fail(f"--{name.replace('_', '-')}: got {getattr(args, name)}, wanted more than 0")
     if config.sim.base != "planar":
         cli.fail(f"sim.base: got '{config.sim.base}', wanted 'planar': the plant is planar")
-    gait = config.gait.names[0]
     if args.keys is None:
-        if gait not in KEYS:
-            cli.fail(f"gait.names: got '{gait}', wanted one of {', '.join(KEYS)}, or give --keys")
-        args.keys = KEYS[gait]
+        args.keys = _own_keys(config)
     return config, args
+
+
+def _own_keys(config: RunConfig) -> tuple[str, ...]:
+    """Weights of the config's gait, and its foothold gain where it has one of its own."""
+    name = config.gait.names[0]
+    own = config.gaits[name]
+    keys = [
+        f"gaits.{name}.{key}"
+        for key in ("state_weights", "input_weight", "velocity_gain")
+        if getattr(own, key) is not None
+    ]
+    return tuple(keys) or ("lmpc.state_weights", "lmpc.input_weight")
 
 
 def _settings(args: Namespace) -> list[Any]:

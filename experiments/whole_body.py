@@ -13,6 +13,7 @@ weights_<gait>.npz (all models). The recordings stay there as well and are used 
 with those of other configs or other code is refused.
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from prediction_models import residual
 from whole_body_recordings import CONFIGS, DT, KINDS, kept, record
 
 from kjax import cli, srb
-from kjax.config import RunConfig, SrbConfig, load_config
+from kjax.config import Gaits, RunConfig, SrbConfig, load_config
 from kjax.koopman import open_loop, storage, whole_body
 from kjax.koopman.features import (
     Features,
@@ -41,6 +42,7 @@ from kjax.resolve import fit_models
 from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import Mode
+from kjax.walkable import build_gaits, contact_problems
 
 HORIZONS = {"25ms": 5, "50ms": 10}  # ticks
 HELD_OUT, TUNE = 0.3, 0.2 / 0.7  # of all episodes, of those left
@@ -224,9 +226,11 @@ def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str
         config = load_config(
             RunConfig, CONFIGS / KINDS[gait].config, {**keys, "lmpc.model_dt": 0.02}
         )
+        config, problem = _within_stance(config)
         with jax.enable_x64(True):
             fits = fit_models(config, go1.PARAMS)
             family = build_family(model_spec(config.koopman))
+            fits = jax.tree.map(lambda a, at=problem: a[at], fits)
             own = fits.model if fits.prediction is None else fits.prediction.numbers
             force = np.zeros((len(Mode), 4)) if fits.prediction is None else fits.prediction.force
             feet = fits.feet if config.koopman.feet == "fixed" else None
@@ -291,6 +295,21 @@ def _body() -> srb.SrbParams:
 
 def _at_end(squared: np.ndarray, rows: np.ndarray) -> float:
     return float(squared[rows, -1].mean())
+
+
+def _within_stance(config: RunConfig) -> tuple[RunConfig, np.ndarray]:
+    """A config whose gait alone is fitted, within its stances; and where each mode's fit lies."""
+    name = config.gait.names[0]
+    own = dataclasses.replace(config.gaits[name], horizon="stance")
+    config = dataclasses.replace(
+        config,
+        gait=dataclasses.replace(config.gait, also=()),
+        gaits=Gaits({**config.gaits, name: own}),
+    )
+    problems, _ = contact_problems(build_gaits(config), config)
+    modes = [problem.mode for problem in problems]
+    # No window is of a mode that the gait has not.
+    return config, np.array([modes.index(mode) if mode in modes else 0 for mode in Mode])
 
 
 def _errors(

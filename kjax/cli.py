@@ -22,7 +22,8 @@ from typing import Any, NoReturn, TypeVar
 import jax
 import tomli_w
 
-from kjax.config import ConfigError, fields, load_config, to_dict
+from kjax.config import ConfigError, GaitConfig, RunConfig, fields, load_config, to_dict
+from kjax.config.gaits import LIBRARY
 
 T = TypeVar("T")
 
@@ -119,25 +120,44 @@ def build_parser(cls: type, description: str) -> argparse.ArgumentParser:
     sections: dict[str, Any] = {}
     for name, info, default in fields(cls):
         section = name.rsplit(".", 1)[0] if "." in name else "run"
+        text = f"{info.description} default: {_shown(default)}"
+        hidden = False
+        if section.startswith("gaits."):  # the same keys for each of them
+            hidden = section != "gaits.trot"
+            section = f"gaits.NAME, of {', '.join(LIBRARY)}, or your own"
         if section not in sections:
             sections[section] = parser.add_argument_group(f"config: {section}")
-        shown = list(default) if isinstance(default, tuple) else default
         sections[section].add_argument(
             f"--{name}",
             dest=f"key:{name}",
             metavar=_type_name(info.annotation),
-            help=f"{info.description} default: {shown}".replace("%", "%%"),
+            help=argparse.SUPPRESS if hidden else text.replace("%", "%%"),
         )
     return parser
+
+
+def _shown(default: Any) -> Any:
+    return list(default) if isinstance(default, tuple) else default
+
+
+def _add_own_gaits(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
+    """Options for gaits that the command line names and the library has not."""
+    own = {word.split(".")[1] for word in words if word.startswith("--gaits.") and "." in word[8:]}
+    for gait in sorted(own - LIBRARY.keys()):
+        for name, _, _ in fields(GaitConfig, f"gaits.{gait}."):
+            parser.add_argument(f"--{name}", dest=f"key:{name}", help=argparse.SUPPRESS)
 
 
 def parse(
     cls: type[T], parser: argparse.ArgumentParser, argv: Sequence[str] | None = None
 ) -> tuple[T, argparse.Namespace]:
     """Config and the other options from a command line; a mistake ends the program."""
+    words = sys.argv[1:] if argv is None else argv
+    if cls is RunConfig:
+        _add_own_gaits(parser, words)
     known = [action.option_strings[0] for action in parser._actions if action.option_strings]
     # A value such as -0.1 or [-1, 2] must not look like an option.
-    args, unknown = parser.parse_known_args(_join_values(sys.argv[1:] if argv is None else argv))
+    args, unknown = parser.parse_known_args(_join_values(words))
     for word in unknown:
         name = word.split("=")[0]
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)

@@ -160,7 +160,6 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
             ForceTask(
                 clock=clock,
                 stance=stance,
-                mode=mode,
                 body=_above_ground(view.planar, ground),
                 valid=valid,
                 lag=wanted.lag,

@@ -20,7 +20,7 @@ from kjax.types import Command, RobotParams
 
 
 class Fits(NamedTuple):
-    """What is learned from data, of every contact mode.
+    """What is learned from data, of every contact mode of every gait (M of them).
 
     Attributes:
       model: linear EDMD models over one step of the data.
@@ -40,8 +40,9 @@ class ControllerParams(NamedTuple):
 
     Attributes:
       robot: geometry and masses.
-      fits: prediction models of every contact mode.
-      modes: weights and bounds of the LMPC within a stance, of every contact mode.
+      fits: prediction models, of the same.
+      modes: weights and bounds of the LMPC within a stance, of every contact mode of every gait.
+      problem: (G, P) which of these each phase of a gait is.
       uncertainty_discount: how much less its uncertain steps weigh; not read where the spec does
         not discount [-].
       friction: mu of its friction rows; not read where the spec has none [-].
@@ -68,6 +69,7 @@ class ControllerParams(NamedTuple):
     robot: RobotParams
     fits: Fits
     modes: ModeSettings
+    problem: Int[Array, "G P"]
     uncertainty_discount: Float[Array, ""]
     friction: Float[Array, ""]
     torque_fraction: Float[Array, ""]

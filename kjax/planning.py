@@ -30,7 +30,6 @@ class ForceTask(NamedTuple):
     Attributes:
       clock: place in the gait.
       stance: (4,) legs that stand.
-      mode: contact mode.
       body: the robot in the sagittal plane, origin on the ground below its centre of mass.
       valid: whether that is what the robot does; else only a safe force is wanted.
       lag: reference of p_x less p_x [m].
@@ -43,7 +42,6 @@ class ForceTask(NamedTuple):
 
     clock: gait.Clock
     stance: Bool[Array, "4"]
-    mode: Int[Array, ""]
     body: PlanarState
     valid: Bool[Array, ""]
     lag: Float[Array, ""]
@@ -98,18 +96,20 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
     family = build_family(spec.model)
     lift = family.lift
 
-    def model_here(tables: Tables, mode: Array, start: Start) -> tuple[Array, LinearModel | None]:
+    def model_here(
+        tables: Tables, problem: Array, start: Start
+    ) -> tuple[Array, LinearModel | None]:
         """Lifted state, and the model where that is not one of the tables."""
         if spec.model.kind == "linear":
             z = lift(None, start)
             if not spec.model.measured_feet:
                 return z, None
-            model = jax.tree.map(lambda a: a[mode], tables.lmpc.model)
+            model = jax.tree.map(lambda a: a[problem], tables.lmpc.model)
             return z, model._replace(B=input_map(model, start.feet))
         fits = tables.params.fits
-        numbers, force, _ = jax.tree.map(lambda a: a[mode], fits.prediction)
+        numbers, force, _ = jax.tree.map(lambda a: a[problem], fits.prediction)
         if not spec.model.measured_feet:
-            start = start._replace(feet=fits.feet[mode])
+            start = start._replace(feet=fits.feet[problem])
         return lift(numbers, start), operating_point(family, numbers, start, force, steps)
 
     limited = spec.friction_rows or spec.torque_rows
@@ -142,22 +142,23 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         fresh = clock.elapsed < 0.5 * spec.control_dt
         last = jnp.where(fresh, 0.0, task.memory.plan[:4])
         start = Start(body.x, feet, last, rate * clock.elapsed, rate)
-        z, model = model_here(tables, task.mode, start)
+        problem = params.problem[clock.gait, clock.phase]
+        z, model = model_here(tables, problem, start)
         solution = solve_lmpc(
-            tables.lmpc, task.mode, z, reference, task.memory, spec, model=model, rows=rows
+            tables.lmpc, problem, z, reference, task.memory, spec, model=model, rows=rows
         )
         # Out of iterations, the solver's point is feasible and no worse than its start; only
         # faulty data makes the shifted last plan the better choice.
         usable = (solution.status <= qp.Status.ITERATION_LIMIT) & task.valid
         fallback = jnp.clip(
             shift_plan(task.memory.plan, spec),
-            tables.lmpc.lower[task.mode],
-            tables.lmpc.upper[task.mode],
+            tables.lmpc.lower[problem],
+            tables.lmpc.upper[problem],
         )
         steps = jnp.where(usable, solution.plan, fallback)
         return ForcePlan(
             force=_on_legs(steps[:4].reshape(2, 2) @ body.rotation.T, task.stance),
-            memory=LmpcMemory(plan=steps, mode=task.mode, warm=solution.warm),
+            memory=LmpcMemory(plan=steps, problem=problem, warm=solution.warm),
             status=solution.status,
             residual=solution.residual,
             iterations=solution.iterations,
@@ -197,7 +198,8 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
 
     def plan(tables: Tables, task: ForceTask) -> ForcePlan:
         params, clock, body = tables.params, task.clock, task.body
-        settings, schedule = params.multiphase, params.schedule
+        settings = multiphase.for_gait(params.multiphase, clock.gait)
+        schedule = params.schedule
         nodes = multiphase.build_nodes(settings, schedule, clock, count, shortest)
         outlook = multiphase.predict(
             settings,

@@ -1,7 +1,7 @@
 """From a config to what a controller is made of: its spec (static) and its parameters (data)."""
 
 import warnings
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import inf
@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax import gait
-from kjax.config import CommandConfig, KoopmanConfig, Overlay, RunConfig, SrbConfig
+from kjax.config import CommandConfig, KoopmanConfig, Overlay, RunConfig
+from kjax.config.gaits import setting, used
 from kjax.gait.reference import SAMPLES, periodic_reference
-from kjax.koopman.edmd import fit_modes, srb_params
+from kjax.koopman.edmd import Point, fit_modes, stack_bodies
 from kjax.koopman.prediction import build_prediction, model_spec
 from kjax.koopman.validate import force_response_error
 from kjax.legs import lateral, swing
@@ -24,8 +25,8 @@ from kjax.mpc.lmpc import ModeSettings
 from kjax.params import ControllerParams, Fits
 from kjax.rigid_body import body_numbers, mean_force, own_body
 from kjax.spec import ControllerSpec, CycleSpec
-from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams
-from kjax.walkable import build_gaits, check_walkable, cycle_nodes
+from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
+from kjax.walkable import Problem, build_gaits, check_walkable, contact_problems, cycle_nodes
 
 
 def resolve(config: RunConfig, robot: RobotParams) -> tuple[ControllerSpec, ControllerParams]:
@@ -79,6 +80,7 @@ def controller_spec(config: RunConfig) -> ControllerSpec:
         max_iterations=lmpc.max_iterations,
         cycle=cycle if nodes else None,
         gaits=tuple((len(one.phases), one.ramp_cycles) for one in gaits),
+        modes=tuple(problem.mode for problem in contact_problems(gaits, config)[0]),
     )
 
 
@@ -94,7 +96,7 @@ def controller_key(config: RunConfig) -> Hashable:
         config.koopman,
         config.lmpc,
         asked,
-        config.bound,
+        config.gaits,
         config.multiphase,
         config.leg,
         config.lateral,
@@ -107,31 +109,48 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
 
     Configs that differ elsewhere, in weights or bounds, share one fit.
     """
-    bound = config.bound
-    sole = float(robot.foot_radius - bound.height)
-    srb = own_body(config.srb, robot, config.lmpc.height)
-    feet = ((bound.feet_front, sole), (-bound.feet_rear, sole))
-    height = config.lmpc.height if config.koopman.model == "srb_hover" else 0.0
+    gaits = build_gaits(config)
+    problems, _ = contact_problems(gaits, config)
+    names = [gaits[problem.gait].name for problem in problems]
+    feet = tuple(_nominal_feet(config, robot, name) for name in names)
+    modes = tuple(problem.mode for problem in problems)
+    hover = config.koopman.model == "srb_hover"
+    heights = tuple(setting(config, name, "height") if hover else 0.0 for name in names)
     # What a file holds may have changed since.
     fit = _fit.__wrapped__ if config.koopman.file else _fit
-    return fit(srb, config.koopman, feet, height)
+    mass, inertia = (float(number) for number in body_numbers(config, robot))
+    return fit(mass, inertia, config.koopman, modes, feet, heights)
+
+
+def _nominal_feet(config: RunConfig, robot: RobotParams, name: str) -> tuple[Point, Point]:
+    """Contact points (x, z) of front and rear legs from the centre of mass, standing still [m]."""
+    own, height = config.gaits[name], setting(config, name, "height")
+    if own.feet_front is None or own.feet_rear is None:
+        body = own_body(config.srb, robot, height)
+        assert body.feet_front is not None  # own_body filled them in
+        assert body.feet_rear is not None
+        return body.feet_front, body.feet_rear
+    sole = float(robot.foot_radius - height)
+    return (own.feet_front, sole), (-own.feet_rear, sole)
 
 
 @lru_cache(maxsize=32)
 def _fit(
-    srb: SrbConfig,
+    mass: float,
+    inertia: float,
     koopman: KoopmanConfig,
-    bound_feet: tuple[tuple[float, float], tuple[float, float]],
-    height: float,
+    modes: tuple[Mode, ...],
+    feet: tuple[tuple[Point, Point], ...],
+    heights: tuple[float, ...],
 ) -> Fits:
-    body = srb_params(srb, {Mode.FRONT: bound_feet, Mode.REAR: bound_feet})
+    body = stack_bodies(mass, inertia, feet)
     key = jax.random.key(koopman.dataset.seed)
-    model, report = _fit_modes(body, koopman, key)
+    model, report = _fit_modes(body, koopman, key, modes=modes)
     if not bool(report.finite.all()):
         raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
     prediction = None
     if koopman.model != "linear":
-        prediction = build_prediction(body, koopman, key, height=height)
+        prediction = build_prediction(body, koopman, key, modes=modes, heights=heights)
     spread = report.residual_rms if prediction is None else prediction.spread
     return jax.device_get(Fits(model, body.feet, spread, prediction))
 
@@ -141,30 +160,27 @@ def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
     if config.koopman.model != "linear":
         return
     gaits = build_gaits(config)
-    planned = {
-        phase.mode
-        for one, nodes in zip(gaits, cycle_nodes(gaits, config), strict=True)
-        for phase in one.phases
-        if one.name in config.gait.names and not nodes.any()
-    }
-    srb = own_body(config.srb, robot, config.lmpc.height)
-    body = jax.device_get(srb_params(srb)._replace(feet=fits.feet))
+    walked = used(config.gaits, config.gait.names)
+    mass, inertia = (float(number) for number in body_numbers(config, robot))
+    bodies = jax.device_get(stack_bodies(mass, inertia, fits.feet))
     duration = config.lmpc.model_dt * config.lmpc.horizon
-    for mode in sorted(planned - {Mode.FLIGHT}):
-        model, here = (jax.tree.map(lambda a, m=mode: a[m], part) for part in (fits.model, body))
+    for index, (g, mode) in enumerate(contact_problems(gaits, config)[0]):
+        if mode == Mode.FLIGHT or gaits[g].name not in walked:
+            continue
+        model, body = (jax.tree.map(lambda a, i=index: a[i], part) for part in (fits.model, bodies))
         error = force_response_error(
             model,
-            here,
+            body,
             MODE_ALPHA[mode],
             steps=round(duration / config.koopman.dataset.dt),
             duration=duration,
         )
         if error > 1.0:
             warnings.warn(
-                f"koopman: over the LMPC's {duration:g} s the velocity that the fitted "
-                f"{mode.name.lower()} model predicts for a held force is {error:.1f} times the "
-                "rigid body's response away from it, so it may throw the robot over; try fewer "
-                "powers (koopman.order), more koopman.dataset.rollouts or another "
+                f"koopman: over the LMPC's {duration:g} s the velocity that the fitted model of "
+                f"{gaits[g].name} ({mode.name.lower()}) predicts for a held force is {error:.1f} "
+                "times the rigid body's response away from it, so it may throw the robot over; try "
+                "fewer powers (koopman.order), more koopman.dataset.rollouts or another "
                 "koopman.dataset.seed",
                 stacklevel=3,
             )
@@ -173,27 +189,32 @@ def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
 def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> ControllerParams:
     """Parameters from a config, or an ``Overlay`` with traced values, and its fits."""
     gaits = build_gaits(config)
-    names = [g.name for g in gaits]
-    leg, bound, sideways = config.leg, config.bound, config.lateral
-    is_bound = np.array([name == "bound" for name in names])
+    names = [one.name for one in gaits]
+    leg, sideways = config.leg, config.lateral
     foresees = cycle_nodes(gaits, config).any(axis=1)
-    mass, inertia = body_numbers(config, robot)
+    mass = body_numbers(config, robot)[0]
+    problems, index = contact_problems(gaits, config)
+
+    def by_gait(key: str) -> Array:
+        return jnp.stack([jnp.asarray(setting(config, name, key), float) for name in names])
+
     return ControllerParams(
         robot=robot,
         fits=fits,
-        modes=mode_settings(config.lmpc, bound, mean_force(config, mass)),
+        modes=problem_settings(config, problems, names, mean_force(gaits, config, mass)),
+        problem=jnp.asarray(index),
         uncertainty_discount=jnp.asarray(config.lmpc.caution, float),
         friction=jnp.asarray(config.lmpc.friction, float),
         torque_fraction=jnp.asarray(config.lmpc.torque_fraction, float),
         schedule=gait.build_schedule(gaits),
         gait_times=jnp.asarray(config.gait.times),
         gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
-        reference=_reference_tables(gaits, config, mass, inertia),
+        reference=_reference_tables(gaits, config, robot),
         multiphase=multiphase_params(gaits, config, robot),
         swing=swing.SwingParams(
-            apex=jnp.where(is_bound, bound.apex, leg.apex),
-            velocity_gain=jnp.where(is_bound, bound.velocity_gain, leg.velocity_gain),
-            offset=jnp.asarray(is_bound)[:, None] * _bound_offset(robot, config),
+            apex=by_gait("apex"),
+            velocity_gain=by_gait("velocity_gain"),
+            offset=jnp.stack([_foothold_offset(robot, config.gaits[name]) for name in names]),
             horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
             hold_after=jnp.asarray(leg.hold_after),
             reach_speed=jnp.asarray(leg.reach_speed),
@@ -217,7 +238,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
             foothold_gain=jnp.asarray(sideways.velocity_gain),
         ),
         command=build_command(config.command),
-        height=jnp.where(is_bound, bound.height, config.lmpc.height),
+        height=by_gait("height"),
         command_slew=jnp.asarray(config.lmpc.command_slew, float),
         height_slew=jnp.asarray(config.lmpc.height_slew, float),
         integral=jnp.stack(
@@ -236,29 +257,41 @@ def build_command(command: CommandConfig) -> Command:
     return Command(np.asarray(command.times, float), values)  # type: ignore[arg-type]
 
 
-_fit_modes = jax.jit(fit_modes, static_argnames="config")
+_fit_modes = jax.jit(fit_modes, static_argnames=("config", "modes"))
 
 
-def mode_settings(lmpc: Any, bound: Any, mean_force: Float[Array, "M 2"]) -> ModeSettings:
-    """Settings per mode: the bound's own in front and rear stance, the LMPC's elsewhere.
+def problem_settings(
+    config: RunConfig | Overlay,
+    problems: Sequence[Problem],
+    names: Sequence[str],
+    mean_force: Float[Array, "G 2"],
+) -> ModeSettings:
+    """Weights and bounds of every problem: those of its gait.
 
     Args:
-      lmpc: section of the config, or an ``Overlay``: weights and bounds.
-      bound: likewise, of front and rear stance.
-      mean_force: (M, 2) F_z per front and rear leg that R penalises the distance from [N].
+      config: of the run, or an ``Overlay``.
+      problems: contact modes of the gaits.
+      names: of the gaits.
+      mean_force: (G, 2) F_z per front and rear leg that R penalises the distance from [N].
     """
-    single = np.isin(np.arange(len(Mode)), [Mode.FRONT, Mode.REAR])[:, None]
-    standing = np.repeat(MODE_ALPHA > 0, 2, axis=1)
+    standing = np.repeat(MODE_ALPHA[[problem.mode for problem in problems]] > 0, 2, axis=1)
 
-    def chosen(of: Callable[[Any], Sequence[float]]) -> Array:
-        return jnp.where(single, jnp.asarray(of(bound), float), jnp.asarray(of(lmpc), float))
+    def each(key: str) -> Array:
+        values = [setting(config, names[problem.gait], key) for problem in problems]
+        return jnp.stack([jnp.asarray(value, float) for value in values])
 
-    hover = jnp.stack([jnp.zeros_like(mean_force), mean_force], axis=-1).reshape(len(Mode), 4)
-    lower = chosen(lambda config: [-config.force_x_max, config.force_z_min] * 2)
-    upper = chosen(lambda config: [config.force_x_max, config.force_z_max] * 2)
+    def pair(x: Array, z: Array) -> Array:
+        return jnp.tile(jnp.stack([x, z], axis=-1), 2)
+
+    force = mean_force[np.array([problem.gait for problem in problems])]
+    hover = jnp.stack([jnp.zeros_like(force), force], axis=-1).reshape(len(problems), 4)
+    lower, upper = (
+        pair(sign * each("force_x_max"), each(f"force_z_{end}"))
+        for sign, end in ((-1.0, "min"), (1.0, "max"))
+    )
     return ModeSettings(
-        state_weights=chosen(lambda config: config.state_weights),
-        input_weights=chosen(lambda config: [config.input_weight] * 4),
+        state_weights=each("state_weights"),
+        input_weights=jnp.tile(each("input_weight")[:, None], 4),
         lower=jnp.where(standing, lower, 0.0),
         upper=jnp.where(standing, upper, 0.0),
         input_reference=jnp.where(standing, hover, 0.0),
@@ -269,53 +302,70 @@ def multiphase_params(
     gaits: list[gait.Gait], config: RunConfig | Overlay, robot: RobotParams
 ) -> multiphase.MultiPhaseParams:
     """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
-    chosen, bound = config.multiphase, config.bound
+    chosen = config.multiphase
     mass, inertia = body_numbers(config, robot)
+
+    def each(key: str) -> Array:
+        values = [setting(config, one.name, key) for one in gaits]
+        return jnp.stack([jnp.asarray(value, float) for value in values])
+
+    feet = []
+    for one in gaits:
+        own = config.gaits[one.name]  # gaits below their hips have no nodes
+        front, rear = own.feet_front, own.feet_rear
+        ends = [1.0, -1.0] if front is None or rear is None else [front, -rear]
+        feet.append(jnp.stack([jnp.asarray(end, float) for end in ends]))
     return multiphase.MultiPhaseParams(
         nodes=jnp.asarray(cycle_nodes(gaits, config)),
-        state_weights=jnp.asarray(chosen.state_weights),
-        input_weight=jnp.asarray(chosen.input_weight),
+        state_weights=each("state_weights"),
+        input_weight=each("input_weight"),
         mass=jnp.asarray(mass),
         inertia=jnp.asarray(inertia * chosen.inertia_scale),
         friction=jnp.asarray(chosen.friction),
         torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
-        force_x_max=jnp.asarray(chosen.force_x_max),
-        force_z=jnp.asarray([chosen.force_z_min, chosen.force_z_max]),
-        feet=jnp.asarray([bound.feet_front, -bound.feet_rear]),
-        velocity_gain=jnp.asarray(bound.velocity_gain),
+        force_x_max=each("force_x_max"),
+        force_z=jnp.stack([each("force_z_min"), each("force_z_max")], axis=-1),
+        feet=jnp.stack(feet),
+        velocity_gain=each("velocity_gain"),
         velocity_time=jnp.asarray(chosen.velocity_time),
         height_time=jnp.asarray(chosen.height_time),
     )
 
 
 def _reference_tables(
-    gaits: list[gait.Gait], config: RunConfig | Overlay, mass: Any, inertia: Any
+    gaits: list[gait.Gait], config: RunConfig | Overlay, robot: RobotParams
 ) -> Array:
-    """Periodic motion of every gait at every ramp level; zero but for a bound that wants one."""
-    bound = config.bound
+    """Periodic motion of every gait at every ramp level; zero where the reference is constant."""
+    mass, inertia = body_numbers(config, robot)
     levels = 1 + max(g.ramp_cycles for g in gaits)
     rows = jnp.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
     for index, one in enumerate(gaits):
-        if one.name != "bound" or bound.reference != "periodic":
+        own = config.gaits[one.name]
+        if own.reference != "periodic":
             continue
-        modes = [phase.mode for phase in one.phases]
+        modes = [contact_mode(phase.stance) for phase in one.phases]
+        # Below the hips both ends share the weight alike.
+        levers = (own.feet_front, own.feet_rear)
+        if own.feet_front is None:
+            levers = (float(np.abs(robot.hip_pos[:, 0]).mean()),) * 2
         cycles = [
             periodic_reference(
-                np.array(one.durations(level)),
+                np.array(one.durations(min(level, one.ramp_cycles))),
                 modes,
-                bound.feet_front,
-                bound.feet_rear,
+                *levers,
                 mass,
                 inertia,
-                bound.force_edge,
+                own.force_edge,
             ).rows
             for level in range(levels)
         ]
-        rows = rows.at[index].set(jnp.stack(cycles))
+        rows = rows.at[index, :, : len(modes)].set(jnp.stack(cycles))
     return rows
 
 
-def _bound_offset(robot: RobotParams, config: RunConfig | Overlay) -> Array:
-    """Foothold of a bound ahead of the hip, standing still, for each leg [m]."""
-    wanted = [config.bound.feet_front] * 2 + [-config.bound.feet_rear] * 2
+def _foothold_offset(robot: RobotParams, own: Any) -> Array:
+    """Foothold of a gait ahead of the hip, standing still, for each leg [m]."""
+    if own.feet_front is None:
+        return jnp.zeros(4)
+    wanted = [own.feet_front] * 2 + [-own.feet_rear] * 2
     return jnp.stack([jnp.asarray(one, float) for one in wanted]) - robot.hip_pos[:, 0]

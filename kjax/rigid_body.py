@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.config import Overlay, RunConfig, SrbConfig
+from kjax.gait import Gait
 from kjax.legs import kinematics
 from kjax.observation import standing
-from kjax.types import GRAVITY, Mode, RobotParams
+from kjax.types import GRAVITY, RobotParams
 
 
 def own_body(srb: SrbConfig, robot: RobotParams, height: float = 0.27) -> SrbConfig:
@@ -70,26 +71,28 @@ def body_numbers(config: RunConfig | Overlay, robot: RobotParams) -> tuple[Any, 
     )
 
 
-def mean_force(config: RunConfig | Overlay, mass: Any) -> Float[Array, "M 2"]:
-    """Vertical force of one front and one rear leg in every contact mode, mean of its stance [N].
+def mean_force(gaits: list[Gait], config: RunConfig | Overlay, mass: Any) -> Float[Array, "G 2"]:
+    """Vertical force of one front and one rear leg of each gait, mean of its stance [N].
 
-    In a gait without flight the stance legs share the weight; flights add what they leave out, and
-    the pairs of a bound carry what leaves no net turn. Zero where the config wants the paper's.
+    Over a cycle the legs carry the weight and leave no net turn:
+    J_f + J_r = m g T,  J_f l_f = J_r l_r,  each shared by the stances of its legs; the levers are
+    alike where the gait's feet stand below the hips. Zero where the config wants the paper's.
     """
-    chosen, bound = config.gait, config.bound
-    weight = mass * GRAVITY
-    trot = (chosen.stance_time + chosen.trot_flight) / chosen.stance_time
-    cycle = bound.front_stance + bound.first_flight + bound.rear_stance + bound.second_flight
-    levers = bound.feet_front + bound.feet_rear
-    front = 0.5 * cycle / bound.front_stance * bound.feet_rear / levers
-    rear = 0.5 * cycle / bound.rear_stance * bound.feet_front / levers
-    shares = {
-        Mode.FLIGHT: (0.0, 0.0),
-        Mode.FRONT: (front, 0.0),
-        Mode.REAR: (0.0, rear),
-        Mode.TROT: (0.5 * trot, 0.5 * trot),
-        Mode.STAND: (0.25, 0.25),
-    }
     on = float(config.lmpc.input_reference == "mean")
-    rows = [jnp.stack([jnp.asarray(part, float) for part in shares[mode]]) for mode in Mode]
-    return on * weight * jnp.stack(rows)
+    rows = []
+    for one in gaits:
+        own = config.gaits[one.name]
+        front, rear = own.feet_front, own.feet_rear
+        share = 0.5 if front is None or rear is None else rear / (front + rear)
+        standing = [
+            sum(phase.duration * sum(phase.stance[i] for i in legs) for phase in one.phases)
+            for legs in ((0, 1), (2, 3))
+        ]
+        rows.append(
+            [
+                part * one.period / time if time > 0 else 0.0
+                for part, time in zip((share, 1.0 - share), standing, strict=True)
+            ]
+        )
+    table = jnp.stack([jnp.stack([jnp.asarray(part, float) for part in row]) for row in rows])
+    return on * mass * GRAVITY * table

@@ -85,6 +85,7 @@ class ControllerSpec:
       max_iterations: limit of the QP.
       cycle: horizon through flight; ``None`` where no gait has one.
       gaits: number of phases of each gait, and of its levels of a ramp.
+      modes: contact mode of each problem within a stance; see ``ControllerParams.problem``.
     """
 
     base: Literal["planar", "free"] = "free"
@@ -102,3 +103,4 @@ class ControllerSpec:
     max_iterations: int = 2000
     cycle: CycleSpec | None = None
     gaits: tuple[tuple[int, int], ...] = ()
+    modes: tuple[int, ...] = ()

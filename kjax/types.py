@@ -4,6 +4,7 @@ World frame: x forward, y left, z up. Everything is SI. Pitch is positive nose *
 rotation from body to world is the textbook ``[[cos, -sin], [sin, cos]]`` on (x, z).
 """
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -30,17 +31,27 @@ class Leg(IntEnum):
 
 
 class Mode(IntEnum):
-    """Contact mode of the planar rigid body; also the index into every per-mode table."""
+    """Contact mode of the planar rigid body: how many legs stand in front and behind."""
 
     FLIGHT = 0
     FRONT = 1
     REAR = 2
-    TROT = 3
+    TROT = 3  # one of each: a pace's too
     STAND = 4
+    ONE_FRONT = 5
+    ONE_REAR = 6
+    TWO_FRONT_ONE_REAR = 7
+    ONE_FRONT_TWO_REAR = 8
 
 
 # Number of stance legs at the front and at the rear (the paper's alpha_i, alpha_j), by mode.
-MODE_ALPHA = np.array([[0, 0], [2, 0], [0, 2], [1, 1], [2, 2]])
+MODE_ALPHA = np.array([[0, 0], [2, 0], [0, 2], [1, 1], [2, 2], [1, 0], [0, 1], [2, 1], [1, 2]])
+
+
+def contact_mode(stance: Sequence[bool]) -> Mode:
+    """Contact mode of four legs, order of ``Leg``, that stand or do not."""
+    count = np.array([sum(map(bool, stance[:2])), sum(map(bool, stance[2:]))])
+    return Mode(int((count == MODE_ALPHA).all(axis=1).argmax()))
 
 
 class Observation(NamedTuple):

@@ -1,51 +1,87 @@
 """The gaits of a config, and whether a robot can walk with it at all."""
 
 import warnings
+from typing import NamedTuple
 
 import numpy as np
 
 from kjax import gait
 from kjax.command import check_command
 from kjax.config import Overlay, RunConfig
+from kjax.config.gaits import setting, used
+from kjax.gait.reference import has_periodic_reference
 from kjax.legs.kinematics import REACH
 from kjax.rigid_body import nominal_feet, own_body
-from kjax.types import COMMAND_NAMES, GRAVITY, MODE_ALPHA, Mode, RobotParams
+from kjax.types import COMMAND_NAMES, GRAVITY, Leg, Mode, RobotParams, contact_mode
 
 MARGIN = 1.2  # least impulse that the feet can give over a cycle, over the weight's
 FACTOR = {"mass": 2.0, "inertia": 4.0}  # from the robot's own that srb may be
 MASS_TOLERANCE = 0.01  # relative; below it srb.mass counts as the robot's own
 
 
+class Problem(NamedTuple):
+    """One contact mode of one gait: an LMPC of its own within a stance.
+
+    Attributes:
+      gait: index of the gait.
+      mode: contact mode.
+    """
+
+    gait: int
+    mode: Mode
+
+
 def build_gaits(config: RunConfig | Overlay) -> list[gait.Gait]:
-    """The gaits of a config, in the order of their indices: trot, bound, stand, landing."""
-    chosen, bound = config.gait, config.bound
-    landing = "landing" if chosen.landing_time > 0 else ""
-    gaits = [
-        gait.trot(chosen.stance_time, chosen.trot_flight),
-        gait.bound(
-            bound.front_stance,
-            bound.first_flight,
-            bound.rear_stance,
-            bound.second_flight,
-            ramp_start=bound.ramp_start,
-            ramp_cycles=bound.ramp_cycles,
-            leave_anywhere=chosen.switch_rule == "anywhere",
-            leave_through=landing,
-        ),
-        gait.stand(),
+    """The gaits that a config compiles, in the order of their indices.
+
+    Those of ``gait.also`` first, then those of ``gait.names``, then those that these are left
+    through.
+    """
+    chosen, gaits = config.gait, config.gaits
+    names = list(dict.fromkeys([*chosen.also, *chosen.names]))
+    names += [name for name in used(gaits, names) if name not in names]
+    return [
+        gait.Gait(
+            name,
+            gait.phases(one.period, one.offset, one.duty),
+            ramp_start=one.ramp_start,
+            ramp_cycles=one.ramp_cycles,
+            switch_rule=one.switch_rule,
+            leave_through=one.leave_through,
+        )
+        for name, one in ((name, gaits[name]) for name in names)
     ]
-    return [*gaits, gait.stand(chosen.landing_time, name=landing)] if landing else gaits
+
+
+def contact_problems(
+    gaits: list[gait.Gait], config: RunConfig | Overlay
+) -> tuple[list[Problem], np.ndarray]:
+    """The problems of all gaits, and (G, P) which of them each phase poses.
+
+    A gait that predicts through flight has only that of flight.
+    """
+    foresees = [bool(row.any()) for row in cycle_nodes(gaits, config)]
+    problems: list[Problem] = []
+    index = np.zeros((len(gaits), max(len(one.phases) for one in gaits)), int)
+    for g, one in enumerate(gaits):
+        for p, phase in enumerate(one.phases):
+            mode = Mode.FLIGHT if foresees[g] else contact_mode(phase.stance)
+            problem = Problem(g, mode)
+            if problem not in problems:
+                problems.append(problem)
+            index[g, p] = problems.index(problem)
+    return problems, index
 
 
 def cycle_nodes(gaits: list[gait.Gait], config: RunConfig | Overlay) -> np.ndarray:
     """Number of nodes (G, P) of each phase; zero for gaits that predict within a stance only."""
     nodes = np.zeros((len(gaits), max(len(g.phases) for g in gaits)), int)
     for index, one in enumerate(gaits):
-        if one.name != "bound" or config.bound.horizon != "multiphase":
+        if config.gaits[one.name].horizon != "multiphase":
             continue
         for place, phase in enumerate(one.phases):
             parts = np.ceil(phase.duration / config.multiphase.node_dt - 1e-9)
-            nodes[index, place] = 1 if phase.mode == Mode.FLIGHT else parts
+            nodes[index, place] = 1 if phase.flies else parts
     return nodes
 
 
@@ -53,22 +89,55 @@ def check_walkable(config: RunConfig, robot: RobotParams) -> None:
     """Refuse a config that this robot cannot walk with; concrete numbers only.
 
     Raises:
-      ValueError: for force bounds and torque limits that cannot carry the weight over a cycle, or
-        give more than it, a height that the legs do not reach, a rigid body that is not the
-        robot's; it names the key.
+      ValueError: for a phase of a gait shorter than a tick, force bounds and torque limits that
+        cannot carry the weight over a cycle, or give more than it, a height that the legs do not
+        reach, a rigid body that is not the robot's; it names the key.
 
     Warns:
       UserWarning: for another mass than the robot's.
     """
     check_command({name: getattr(config.command, name) for name in COMMAND_NAMES})
     _check_body(config, robot)
-    gaits = build_gaits(config)
-    nodes = [bool(row.any()) for row in cycle_nodes(gaits, config)]
-    used = {*config.gait.names, *(["landing"] if config.gait.landing_time > 0 else [])}
-    for one, foresees in zip(gaits, nodes, strict=True):
-        if one.name in used:
+    walked = used(config.gaits, config.gait.names)
+    for one in build_gaits(config):
+        _check_timing(config, one)
+        if one.name in walked:
             _check_reach(config, robot, one.name)
-            _check_weight(config, robot, one, foresees)
+            _check_weight(config, robot, one)
+
+
+def _check_timing(config: RunConfig, one: gait.Gait) -> None:
+    """Refuse a gait whose phases the clock, the reference or the horizon cannot take."""
+    name, own = f"gaits.{one.name}", config.gaits[one.name]
+    tick = config.lmpc.control_dt
+    for phase, duration in zip(one.phases, one.durations(0), strict=True):
+        if duration < tick - 1e-9:
+            legs = [leg.name for leg in Leg if phase.stance[leg]]
+            kind = f"stance of {', '.join(legs)}" if legs else "flight"
+            if not legs and one.ramp_cycles:
+                kind += " times ramp_start"
+            raise ValueError(
+                f"{name}: offset and duty leave a {kind} of {duration:.4g} s, shorter than "
+                f"lmpc.control_dt {tick:g} s"
+            )
+    ends = [(any(phase.stance[:2]), any(phase.stance[2:])) for phase in one.phases]
+    if own.horizon == "multiphase" and (True, True) in ends:
+        raise ValueError(
+            f"{name}.horizon = 'multiphase' takes no phase in which front and rear legs stand at "
+            "once; set horizon = 'stance', or another offset and duty"
+        )
+    modes = [contact_mode(phase.stance) for phase in one.phases]
+    if own.reference == "periodic" and not has_periodic_reference(modes):
+        raise ValueError(
+            f"{name}.reference = 'periodic' needs stances of front and of rear legs that lift off "
+            "after each phase; set reference = 'constant', or another offset and duty"
+        )
+    try:
+        one.may_leave()
+    except ValueError:
+        raise ValueError(
+            f"{name}.switch_rule = 'first_flight', but {one.name} has no flight"
+        ) from None
 
 
 def _check_body(config: RunConfig, robot: RobotParams) -> None:
@@ -118,56 +187,43 @@ def _check_contact_points(config: RunConfig, robot: RobotParams) -> None:
         )
 
 
-def _check_weight(config: RunConfig, robot: RobotParams, one: gait.Gait, foresees: bool) -> None:
+def _check_weight(config: RunConfig, robot: RobotParams, one: gait.Gait) -> None:
     """Refuse bounds of the forces that cannot carry the weight, or give more than it."""
-    period = sum(phase.duration for phase in one.phases)
-    weight = float(robot.mass) * GRAVITY * period
+    own = config.gaits[one.name]
+    section = "multiphase" if own.horizon == "multiphase" else "lmpc"
+    weight = float(robot.mass) * GRAVITY * one.period
     needed = MARGIN * weight
-    given, least, strong = 0.0, 0.0, 0.0
-    keys: set[str] = set()
-    for phase in one.phases:
-        name = "lmpc"
-        if phase.mode in (Mode.FRONT, Mode.REAR):
-            name = "multiphase" if foresees else "bound"
-        section = getattr(config, name)
-        rows = config.lmpc if name == "bound" else section
-        feet = int(MODE_ALPHA[phase.mode].sum())
-        if not feet:
-            continue
-        keys.add(name)
-        given += phase.duration * feet * section.force_z_max
-        least += phase.duration * feet * section.force_z_min
-        strong += phase.duration * feet * rows.torque_fraction * _calf_force(config, robot, one)
-    cycle = f"in a cycle of {one.name} ({period:g} s)"
+    standing = sum(phase.duration * sum(phase.stance) for phase in one.phases)
+    given, least = (
+        standing * setting(config, one.name, f"force_z_{end}") for end in ("max", "min")
+    )
+    fraction = getattr(config, section).torque_fraction
+    strong = standing * fraction * _calf_force(config, robot, one.name)
+    cycle = f"in a cycle of {one.name} ({one.period:g} s)"
     mass = f"{float(robot.mass):.4g} kg"
     if given < needed:
         raise ValueError(
-            f"{_names(keys, 'force_z_max')}: {cycle} the feet can give {given:.4g} N s, and "
+            f"gaits.{one.name}.force_z_max: {cycle} the feet can give {given:.4g} N s, and "
             f"{needed:.4g} N s are needed for {mass} ({MARGIN:g} times its weight); raise it by a "
             f"factor of {needed / given:.3g}"
         )
     if MARGIN * least > weight:
         raise ValueError(
-            f"{_names(keys, 'force_z_min')}: {cycle} the feet give at least {least:.4g} N s, and "
+            f"gaits.{one.name}.force_z_min: {cycle} the feet give at least {least:.4g} N s, and "
             f"{mass} weigh {weight:.4g} N s: the robot would fly off; it must be at most "
             f"{weight / (MARGIN * least):.3g} of what it is"
         )
     if strong < needed:
-        keys = {"lmpc" if name == "bound" else name for name in keys}
         raise ValueError(
-            f"{_names(keys, 'torque_fraction')}: {cycle} the calf joints can press {strong:.4g} "
+            f"{section}.torque_fraction: {cycle} the calf joints can press {strong:.4g} "
             f"N s, and {needed:.4g} N s are needed for {mass} ({MARGIN:g} times its weight)"
         )
 
 
-def _names(sections: set[str], key: str) -> str:
-    return " and ".join(f"{section}.{key}" for section in sorted(sections))
-
-
-def _calf_force(config: RunConfig, robot: RobotParams, one: gait.Gait) -> float:
+def _calf_force(config: RunConfig, robot: RobotParams, name: str) -> float:
     """Vertical force at which the calf's torque limit is reached, foot below the hip [N]."""
     thigh, calf = float(robot.thigh_length), float(robot.calf_length)
-    drop = _drop(config, robot, one.name)
+    drop = _drop(config, robot, name)
     # Height of the knee's triangle (law of cosines): the lever of a force along the line hip-foot.
     along = (thigh**2 - calf**2 + drop**2) / (2.0 * drop)
     lever = np.sqrt(max(thigh**2 - along**2, 1e-12))
@@ -176,18 +232,17 @@ def _calf_force(config: RunConfig, robot: RobotParams, one: gait.Gait) -> float:
 
 def _drop(config: RunConfig, robot: RobotParams, name: str) -> float:
     """Depth of the foot centre below the hip at the reference height [m]."""
-    height = (config.bound if name == "bound" else config.lmpc).height
+    height = float(setting(config, name, "height"))
     return height - float(robot.foot_radius) + float(robot.hip_pos[:, 2].mean())
 
 
 def _check_reach(config: RunConfig, robot: RobotParams, name: str) -> None:
-    section = "bound" if name == "bound" else "lmpc"
-    height = getattr(config, section).height
+    height = setting(config, name, "height")
     low, high = np.array(REACH) * float(robot.thigh_length + robot.calf_length)
     drop = _drop(config, robot, name)
     asked = (0.0, *config.command.height)
     if not (low < drop + min(asked) and drop + max(asked) < high):
-        key = f"{section}.height is {height:g} m"
+        key = f"gaits.{name}.height is {height:g} m"
         if any(asked):
             key += f" and command.height {min(asked):+g} to {max(asked):+g} m"
         raise ValueError(

@@ -26,15 +26,17 @@ def refusal(capsys, *words):
 
 def test_any_key_can_be_overridden_by_its_dotted_name():
     config, _ = parse(
-        "--lmpc.horizon", "9", "--gait.switch_rule=anywhere", "--lmpc.force_z_min", "-5.0"
+        "--lmpc.horizon", "9", "--gaits.bound.switch_rule=anywhere", "--lmpc.force_z_min", "-5.0"
     )
     assert (config.lmpc.horizon, config.lmpc.force_z_min) == (9, -5.0)
-    assert config.gait.switch_rule == "anywhere"
+    assert config.gaits.bound.switch_rule == "anywhere"
 
 
 def test_lists_are_written_as_in_toml():
     config, _ = parse("--command.times", "[0, 1]", "--command.v_x", "[-0.1, 0.2]")
     assert config.command.v_x == (-0.1, 0.2)
+    config, _ = parse("--gaits.gallop.period", "0.4", "--gait.names", '["gallop"]')
+    assert config.gaits["gallop"].period == 0.4
     config, _ = parse("--gait.names", '["trot", "bound"]', "--gait.times=[0, 2.5]")
     assert config.gait.names == ("trot", "bound")
     assert config.gait.times == (0.0, 2.5)
@@ -54,7 +56,7 @@ def test_help_shows_every_key_with_type_unit_and_default(capsys):
         parse("--help")
     text = " ".join(capsys.readouterr().out.split())
     assert "--lmpc.control_dt FLOAT Time between two plans [s]. default: 0.005" in text
-    assert "--gait.switch_rule {flight,anywhere} When a bound may be left" in text
+    assert "--gaits.trot.switch_rule {anywhere,first_flight,cycle_end} When it may be left" in text
     assert "--gait.names LIST" in text
 
 

@@ -1,14 +1,17 @@
+import dataclasses
 from pathlib import Path
 
 import pytest
 
 from kjax.config import (
-    BoundConfig,
     ConfigError,
     DatasetConfig,
     FitStudyConfig,
     GaitConfig,
+    Gaits,
+    GaitTimesConfig,
     LmpcConfig,
+    Overlay,
     RunConfig,
     SrbConfig,
     SweepConfig,
@@ -16,6 +19,7 @@ from kjax.config import (
     load_config,
     to_dict,
 )
+from kjax.config.gaits import LIBRARY, setting
 
 
 def message(overrides, cls=RunConfig, path=None):
@@ -52,28 +56,39 @@ def message(overrides, cls=RunConfig, path=None):
             {"gait.names": ["trot", "bound", "trot"], "gait.times": [0.0, 2.0, 1.0]},
             ("gait", "increase", "[0.0, 2.0, 1.0]"),
         ),
-        ({"gait.switch_rule": "flght"}, ("gait.switch_rule", "did you mean 'flight'")),
-        ({"bound.reference": "none"}, ("bound.reference", "got 'none'")),
-        ({"bound.force_z_min": 400.0}, ("bound", "force_z_min", "400.0", "300.0")),
-        ({"bound.force_z_max": 10.0}, ("bound", "force_z_min", "20.0", "10.0")),
-        ({"bound.ramp_start": 0.0}, ("bound.ramp_start", "got 0.0", "greater than 0")),
-        ({"bound.ramp_start": 1.5}, ("bound.ramp_start", "got 1.5", "less than or equal to 1")),
-        ({"bound.ramp_cycles": -1}, ("bound.ramp_cycles", "got -1")),
-        ({"gait.stance_time": 0.004}, ("gait.stance_time", "0.004", "lmpc.control_dt", "0.005")),
-        ({"bound.front_stance": 0.004}, ("bound.front_stance", "0.004", "control_dt", "0.005")),
-        ({"bound.rear_stance": 0.004}, ("bound.rear_stance", "0.004", "control_dt", "0.005")),
-        ({"bound.first_flight": 0.01}, ("bound.first_flight", "ramp_start", "0.003", "0.005")),
-        ({"bound.second_flight": 0.01}, ("bound.second_flight", "ramp_start", "0.003", "0.005")),
-        ({"bound.ramp_start": 0.04}, ("flight", "ramp_start", "0.004", "lmpc.control_dt 0.005")),
-        ({"lmpc.control_dt": 0.06}, ("bound.rear_stance", "0.05", "lmpc.control_dt 0.06")),
-        pytest.param(
-            {"gait.trot_flight": 0.002},
-            ("gait.trot_flight", "0.002", "lmpc.control_dt", "0.005"),
+        (
+            {"gaits.bound.switch_rule": "first_flght"},
+            ("gaits.bound.switch_rule", "did you mean 'first_flight'"),
         ),
-        pytest.param(
-            {"gait.landing_time": 0.002},
-            ("gait.landing_time", "0.002", "lmpc.control_dt", "0.005"),
+        ({"gaits.trot.perod": 0.4}, ("gaits.trot.perod", "did you mean 'gaits.trot.period'")),
+        ({"gaits.trot.duty": [0.5, 0.5, 0.5, 1.2]}, ("gaits.trot.duty", "1.2", "or equal to 1")),
+        ({"gaits.trot.offset": [0.0, 1.0, 0.0, 0.0]}, ("gaits.trot.offset", "1.0", "less than 1")),
+        ({"gaits.trot.feet_front": 0.1}, ("gaits.trot", "feet_front and feet_rear belong")),
+        ({"gaits.trot.horizon": "multiphase"}, ("gaits.trot", "needs feet_front and feet_rear")),
+        ({"gaits.bound.leave_through": "land"}, ("gaits.bound.leave_through", "'landing'")),
+        ({"gait.also": ["walkk"]}, ("gait.also", "'walkk'", "did you mean 'walk'")),
+        ({"gaits.own.period": "a"}, ("gaits.own.period", "got 'a'")),
+        # Keys of earlier versions
+        ({"bound.height": 0.3}, ("bound.height", "is now gaits.bound.height")),
+        ({"bound.front_stance": 0.1}, ("bound.front_stance", "period, offset and duty")),
+        ({"bound.horizon": "multiphase"}, ("bound.horizon", "bound_multiphase")),
+        (
+            {"multiphase.force_x_max": 80.0},
+            ("multiphase.force_x_max", "is now gaits.bound_multiphase.force_x_max"),
         ),
+        ({"gait.stance_time": 0.2}, ("gait.stance_time", "gaits.trot.period")),
+        ({"gait.trot_flight": 0.05}, ("gait.trot_flight", "flying_trot")),
+        ({"gait.switch_rule": "anywhere"}, ("gait.switch_rule", "gaits.bound.switch_rule")),
+        ({"gait.landing_time": 0.1}, ("gait.landing_time", "leave_through = 'landing'")),
+        ({"gaits.bound.reference": "none"}, ("gaits.bound.reference", "got 'none'")),
+        ({"gaits.bound.force_z_min": 400.0}, ("bound", "force_z_min", "400.0", "300.0")),
+        ({"gaits.bound.force_z_max": 10.0}, ("bound", "force_z_min", "20.0", "10.0")),
+        ({"gaits.bound.ramp_start": 0.0}, ("gaits.bound.ramp_start", "got 0.0", "greater than 0")),
+        (
+            {"gaits.bound.ramp_start": 1.5},
+            ("gaits.bound.ramp_start", "got 1.5", "less than or equal to 1"),
+        ),
+        ({"gaits.bound.ramp_cycles": -1}, ("gaits.bound.ramp_cycles", "got -1")),
         ({"duration": 0.004}, ("duration", "0.004", "lmpc.control_dt 0.005")),
         ({"duration": 0.0}, ("duration", "got 0.0", "greater than 0")),
         ({"lmpc.force_z_min": 200.0}, ("lmpc", "force_z_min", "200.0", "160.0")),
@@ -179,19 +194,37 @@ def test_building_a_config_in_python_checks_it_too():
     with pytest.raises(ValueError, match="force_z"):
         DatasetConfig(force_z=(10.0, 0.0))
     with pytest.raises(ValueError, match="force_z_min must not exceed force_z_max"):
-        BoundConfig(force_z_min=30.0, force_z_max=20.0)
+        RunConfig(gaits=Gaits({"trot": GaitConfig(force_z_min=30.0, force_z_max=20.0)}))
     with pytest.raises(ValueError, match="times must increase"):
-        GaitConfig(names=("trot", "bound", "trot"), times=(0.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="shorter than"):
-        RunConfig(bound=BoundConfig(first_flight=0.01))
+        GaitTimesConfig(names=("trot", "bound", "trot"), times=(0.0, 1.0, 1.0))
 
 
-def test_phases_as_short_as_a_tick_are_allowed():
-    """A flight need only reach the tick at its shortest, where its ramp begins."""
-    shortest = {"bound.front_stance": 0.005, "bound.rear_stance": 0.005, "bound.ramp_start": 0.5}
-    shortest |= {"bound.first_flight": 0.01, "bound.second_flight": 0.01, "gait.trot_flight": 0.0}
-    config = load_config(RunConfig, None, shortest)
-    assert config.bound.first_flight * config.bound.ramp_start == config.lmpc.control_dt
+def test_a_gait_of_a_config_changes_the_librarys_or_is_its_own():
+    keys = {"gaits.bound.apex": 0.1, "gaits.gallop.offset": [0.0, 0.1, 0.5, 0.6], "seed": 3}
+    config = load_config(RunConfig, None, keys)
+    assert config.gaits.bound == dataclasses.replace(LIBRARY["bound"], apex=0.1)
+    assert config.gaits["gallop"] == GaitConfig(offset=(0.0, 0.1, 0.5, 0.6))
+    assert config.gaits.trot == LIBRARY["trot"]
+    assert set(config.gaits) == {*LIBRARY, "gallop"}
+    with pytest.raises(AttributeError):
+        _ = config.gaits.canter
+    # As plain data: what is not the library's, and what is walked, in full.
+    data = to_dict(config)
+    assert set(data["gaits"]) == {"trot", "bound", "gallop"}
+    assert load_config(RunConfig, None, data) == config
+    assert hash(load_config(RunConfig, None, data)) == hash(config)
+    assert dataclasses.replace(config, seed=4).gaits is config.gaits
+    assert config != load_config(RunConfig, None, keys | {"gaits.bound.apex": 0.11})
+
+
+def test_what_a_gait_does_not_give_is_the_lmpcs_or_the_legs():
+    keys = {"lmpc.height": 0.25, "leg.apex": 0.08, "gaits.pace.height": 0.26}
+    config = load_config(RunConfig, None, keys)
+    found = {name: setting(config, name, "height") for name in ("trot", "pace", "bound")}
+    assert found == {"trot": 0.25, "pace": 0.26, "bound": 0.27}
+    assert setting(config, "pronk", "apex") == 0.08
+    seen = Overlay(config, {"gaits.pace.height": 0.3, "lmpc.height": 0.2})
+    assert [setting(seen, name, "height") for name in ("trot", "pace", "bound")] == [0.2, 0.3, 0.27]
 
 
 def test_gaits_follow_one_another_at_their_times():
@@ -204,8 +237,8 @@ def test_gaits_follow_one_another_at_their_times():
 
 def test_the_bound_s_force_limits_may_be_switched_off():
     infinite = {"force_x_max": float("inf"), "force_z_max": float("inf")}
-    config = load_config(RunConfig, None, {f"bound.{key}": v for key, v in infinite.items()})
-    assert config.bound.force_x_max == config.bound.force_z_max == float("inf")
+    config = load_config(RunConfig, None, {f"gaits.bound.{key}": v for key, v in infinite.items()})
+    assert config.gaits.bound.force_x_max == config.gaits.bound.force_z_max == float("inf")
 
 
 @pytest.mark.parametrize("cls", [RunConfig, FitStudyConfig])

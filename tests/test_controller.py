@@ -19,7 +19,7 @@ from kjax.planning import reference_trajectory
 from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
 from kjax.types import Leg, Mode
-from kjax.walkable import build_gaits
+from kjax.walkable import build_gaits, contact_problems
 
 HIP_X, COM_X = 0.1881, -0.00208199  # m
 CONFIG = load_config(RunConfig, None, {"sim.base": "planar"})
@@ -62,7 +62,7 @@ def bounding(**changes):
 
     Its parameters have the shapes of the default's, so that both share their compiled functions.
     """
-    chosen = {"sim.base": "planar", "gait.names": ["bound"], "bound.ramp_start": 1.0}
+    chosen = {"sim.base": "planar", "gait.names": ["bound"], "gaits.bound.ramp_start": 1.0}
     return load_config(RunConfig, None, chosen | changes)
 
 
@@ -257,7 +257,7 @@ def test_legs_swing_from_the_end_of_their_stance_to_its_next_beginning(two_bound
 
 
 def test_a_bound_ramps_up_by_its_flights(controller, plan):
-    tables = condense(*resolve(bounding(**{"bound.ramp_start": 0.5}), go1.PARAMS))
+    tables = condense(*resolve(bounding(**{"gaits.bound.ramp_start": 0.5}), go1.PARAMS))
     states, infos = plans(controller, tables, plan, 50 + 52 + 54)
     # Half of 20 ticks of flight, and a tick more in each of 10 cycles.
     expected = []
@@ -346,13 +346,13 @@ def test_only_a_bound_has_a_periodic_reference_and_only_if_it_is_asked_for(bound
     names = ("trot", "bound", "stand")
     for name, rows in zip(names, reference, strict=True):
         assert rows.any() == (name == "bound")
-    constant = condense(*resolve(bounding(**{"bound.reference": "constant"}), go1.PARAMS))
+    constant = condense(*resolve(bounding(**{"gaits.bound.reference": "constant"}), go1.PARAMS))
     assert constant.params.reference.shape == reference.shape
     np.testing.assert_array_equal(constant.params.reference, 0.0)
 
 
 def test_a_constant_reference_is_level_and_at_rest_in_every_phase(controller, plan):
-    tables = condense(*resolve(bounding(**{"bound.reference": "constant"}), go1.PARAMS))
+    tables = condense(*resolve(bounding(**{"gaits.bound.reference": "constant"}), go1.PARAMS))
     _, infos = plans(controller, tables, plan, 70)
     assert infos.mode.tolist() == CYCLE
     level = np.tile([0.27, 0.0, 0.0, 0.0, 0.0], (70, 1))
@@ -367,7 +367,7 @@ def test_gaits_are_switched_at_their_times_in_one_trace(controller):
     is that of the next cycle, from 0.3 + 0.35 + 0.1 s on.
     """
     chosen = {"gait.names": ["trot", "bound", "trot", "bound", "stand"]}
-    chosen |= {"gait.times": [0.0, 0.1, 0.18, 0.3, 0.53], "gait.stance_time": 0.22}
+    chosen |= {"gait.times": [0.0, 0.1, 0.18, 0.3, 0.53], "gaits.trot.period": 0.44}
     config = bounding(**chosen)
     counted = jax.jit(chex.assert_max_traces(controller.plan, n=1))
     states, infos = plans(controller, condense(*resolve(config, go1.PARAMS)), counted, 170)
@@ -387,14 +387,14 @@ def test_gaits_are_switched_at_their_times_in_one_trace(controller):
 def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait():
     trot, bound, stand = build_gaits(bounding())
     assert trot.leave_through == bound.leave_through == stand.leave_through == ""
-    config = bounding(**{"gait.landing_time": 0.06, "gait.trot_flight": 0.02})
+    config = bounding(
+        **{"gaits.bound.leave_through": "landing", "gaits.landing.period": 0.06}
+        | {"gaits.trot.period": 0.54, "gaits.trot.duty": [0.25 / 0.54] * 4}
+    )
     *others, landing = gaits = build_gaits(config)
     assert [g.leave_through for g in others] == ["", "landing", ""]
-    assert [(p.mode, p.stance, p.duration) for p in landing.phases] == [
-        (Mode.STAND, (True,) * 4, 0.06)
-    ]
-    assert landing.leave_when_done
-    assert [g.leave_when_done for g in others] == [False, True, False]
+    assert [(p.stance, p.duration) for p in landing.phases] == [((True,) * 4, 0.06)]
+    assert [g.switch_rule for g in gaits] == ["anywhere", "first_flight", "anywhere", "cycle_end"]
     # One number for each gait, and the landing is at the trot's height.
     tables = condense(*resolve(config, go1.PARAMS))
     assert (
@@ -409,12 +409,17 @@ def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait
 
 
 @pytest.mark.parametrize(
-    ("rule", "free"), [("flight", [False, True, False, False]), ("anywhere", [True] * 4)]
+    ("rule", "free"),
+    [
+        ("first_flight", [False, True, False, False]),
+        ("anywhere", [True] * 4),
+        ("cycle_end", [True, False, False, False]),
+    ],
 )
 def test_the_rule_says_in_which_phases_a_bound_may_be_left(rule, free):
-    trot, bound, stand = build_gaits(bounding(**{"gait.switch_rule": rule}))
-    assert [phase.may_leave for phase in bound.phases] == free
-    assert all(phase.may_leave for phase in trot.phases + stand.phases)
+    trot, bound, stand = build_gaits(bounding(**{"gaits.bound.switch_rule": rule}))
+    assert bound.may_leave() == free
+    assert all(trot.may_leave() + stand.may_leave())
 
 
 @pytest.mark.parametrize(("slew", "ticks"), [(4.0, 25), (10.0, 10), (np.inf, 1)])
@@ -439,7 +444,7 @@ def test_the_reference_velocity_follows_the_command_at_its_largest_rate(
 @pytest.mark.parametrize("rise", [0.07, 0.0, -0.27, -2.0, 1e4])
 def test_heights_are_measured_from_the_stance_feet_wherever_zero_is(controller, plan, rise):
     """In stance, then in the air, where the ground of the last stance holds on."""
-    config = bounding(**{"bound.reference": "constant"})
+    config = bounding(**{"gaits.bound.reference": "constant"})
     tables = condense(*resolve(config, go1.PARAMS))
     high = standing(base_pos=standing().base_pos + np.array([0.0, 0.0, rise]))
     _, infos = plans(controller, tables, plan, 30, high)
@@ -466,6 +471,8 @@ def test_the_model_of_a_bound_stands_where_its_feet_do(bound_tables):
     B = (
         float(go1.PARAMS.pitch_inertia) / 1e-3 * np.asarray(bound_tables.params.fits.model.B)[:, 6]
     )  # moment per force
+    modes = [mode for _, mode in contact_problems(build_gaits(bounding()), bounding())[0]]
+    assert sorted(modes) == sorted([Mode.TROT, Mode.FRONT, Mode.FLIGHT, Mode.REAR, Mode.STAND])
     ahead = {
         Mode.FRONT: [2 * 0.075, 0.0],
         Mode.REAR: [0.0, -2 * 0.148],
@@ -476,10 +483,10 @@ def test_the_model_of_a_bound_stands_where_its_feet_do(bound_tables):
     for mode, arms in ahead.items():
         # The pitch rate is linear in the forces: the fit is exact but for rounding; MuJoCo's figure
         # is given to 1e-8.
-        np.testing.assert_allclose(B[mode, 1::2], arms, rtol=0, atol=3e-8)
+        np.testing.assert_allclose(B[modes.index(mode), 1::2], arms, rtol=0, atol=3e-8)
     # Below the centre of mass lies, at 0.27 m, the sole, and a radius higher the foot's centre.
     for mode, column in ((Mode.FRONT, 0), (Mode.REAR, 2)):
-        assert 0.27 - go1.FOOT_RADIUS - 1e-9 <= B[mode, column] / 2 <= 0.27 + 1e-9
+        assert 0.27 - go1.FOOT_RADIUS - 1e-9 <= B[modes.index(mode), column] / 2 <= 0.27 + 1e-9
 
 
 def test_a_bound_s_feet_swing_to_their_own_footholds(controller, bound_tables, plan, act):
@@ -606,13 +613,13 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         state, info = plan(tables, state, observation)
         assert info.status == qp.Status.SOLVED
     last = before[-1]
-    stance_time = config.gait.stance_time
+    stance_time = 0.5 * config.gaits.trot.period
     view = build_base(config.sim.base).view(tables.params.robot, None, observation)
     feet = np.array(view.planar.feet - view.planar.x[:2]).reshape(2, 2, 2)
     feet[..., 1] -= go1.FOOT_RADIUS
     ends = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
     family = prediction.build_family(prediction.model_spec(config.koopman))
-    numbers, force, _ = jax.tree.map(lambda a: a[Mode.TROT], tables.params.fits.prediction)
+    numbers, force, _ = jax.tree.map(lambda a: a[0], tables.params.fits.prediction)
 
     def forces(u_before, elapsed):
         start = families.Start(
@@ -629,7 +636,7 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         memory = last.memory
         solved = solve_lmpc(
             tables.lmpc,
-            jnp.asarray(Mode.TROT),
+            jnp.asarray(0),  # the trot's only problem
             z,
             reference,
             memory,
@@ -653,7 +660,7 @@ def test_a_fit_that_misjudges_forces_is_warned_of_and_a_good_one_is_not(recwarn)
     condense(*resolve(config, go1.PARAMS))
     assert not [w for w in recwarn if "koopman" in str(w.message)]
     faulty = dataclasses.replace(config, koopman=KoopmanConfig(feet="measured"))
-    with pytest.warns(UserWarning, match=r"trot model predicts for a held force is 4\.9 times"):
+    with pytest.warns(UserWarning, match=r"model of trot \(trot\) predicts for .* 4\.9 times"):
         condense(*resolve(faulty, go1.PARAMS))
 
 

@@ -17,6 +17,7 @@ from kjax.config import FitStudyConfig, PushConfig, RunConfig, fields, load_conf
 from kjax.koopman import storage
 from kjax.sim.episode import metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
+from kjax.types import Mode
 
 SHORT = {
     "sim.base": "planar",
@@ -125,8 +126,10 @@ def test_a_file_that_holds_no_results_is_a_line_and_exit_code_2(tmp_path, capsys
 
 
 def retrain(path, value):
-    spread = np.full((5, 6), value)
-    return storage.save(path, storage.Stored("residual", 0.005, np.zeros((5, 6, 17)), spread))
+    spread = np.full((len(Mode), 6), value)
+    return storage.save(
+        path, storage.Stored("residual", 0.005, np.zeros((len(Mode), 6, 17)), spread)
+    )
 
 
 def with_file(path):
@@ -244,8 +247,8 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
 
 def test_a_config_that_needs_another_simulation_is_refused(config, simulation):
     with pytest.raises(ValueError, match="simulation_key"):
-        simulate(simulation, dataclasses.replace(config, bound=dataclasses.replace(
-            config.bound, apex=0.1)))  # fmt: skip
+        simulate(simulation, dataclasses.replace(config, leg=dataclasses.replace(
+            config.leg, apex=0.1)))  # fmt: skip
 
 
 PARENT = """

@@ -18,10 +18,14 @@ TIMES = [0.0, 0.4]
 def config(**changes):
     chosen = {
         "sim.base": "planar",
-        "gait.names": ["bound", "trot"],
+        "gait.also": ["trot", "bound_multiphase"],
+        "gait.names": ["bound_multiphase", "trot"],
         "gait.times": TIMES,
-        "bound.horizon": "multiphase",
-        "bound.ramp_start": 1.0,
+        "gaits.bound_multiphase.ramp_start": 1.0,
+        "gaits.bound_multiphase.height": 0.27,
+        "gaits.bound_multiphase.feet_front": 0.075,
+        "gaits.bound_multiphase.feet_rear": 0.148,
+        "gaits.bound_multiphase.velocity_gain": 0.075,
         "lmpc.integral_gains": [2.0, 1.0],
         "command.times": [0.0],
         "command.v_x": [0.05],

@@ -9,7 +9,6 @@ from kjax import RunConfig, build_controller, condense, load_config, resolve
 from kjax.observation import standing
 from kjax.params import with_params
 from kjax.robots import go1
-from kjax.types import Mode
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +49,12 @@ def test_a_plan_has_a_derivative_by_a_weight(both):
     )
 
     def force(weight):
-        Q = jnp.asarray(params.modes.state_weights).at[Mode.TROT, 3].set(weight)
+        Q = jnp.asarray(params.modes.state_weights).at[0, 3].set(weight)
         tables = condense(spec, params._replace(modes=params.modes._replace(state_weights=Q)))
         state, _ = controller.plan(tables, controller.init(tables, seen), seen)
         return state.force[:, 0].sum()
 
-    weight = float(params.modes.state_weights[Mode.TROT, 3])
+    weight = float(params.modes.state_weights[0, 3])
     force = jax.jit(force)
     slope = jax.grad(force)(weight)
     step = 1e-3 * weight

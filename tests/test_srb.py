@@ -1,5 +1,6 @@
 """The planar rigid body against closed forms, against scipy and against complex arithmetic."""
 
+import itertools
 from functools import partial
 
 import chex
@@ -10,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kjax import srb
-from kjax.types import MODE_ALPHA, Mode
+from kjax.types import MODE_ALPHA, Mode, contact_mode
 
 G = 9.81  # m/s^2
 MASS, INERTIA = 12.7, 0.39
@@ -117,7 +118,12 @@ def test_derivative_equals_the_complex_form_of_the_paper_in_every_mode(dtype, mo
 
 def test_modes_count_the_stance_legs_at_each_end():
     expected = {"FLIGHT": (0, 0), "FRONT": (2, 0), "REAR": (0, 2), "TROT": (1, 1), "STAND": (2, 2)}
+    expected |= {"ONE_FRONT": (1, 0), "ONE_REAR": (0, 1)}
+    expected |= {"TWO_FRONT_ONE_REAR": (2, 1), "ONE_FRONT_TWO_REAR": (1, 2)}
     assert {mode.name: tuple(MODE_ALPHA[mode]) for mode in Mode} == expected
+    for stance in itertools.product((False, True), repeat=4):
+        alpha = (sum(stance[:2]), sum(stance[2:]))
+        assert expected[contact_mode(stance).name] == alpha
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from kjax.config import ConfigError, RunConfig
 from kjax.resolve import resolve
 from kjax.rigid_body import mean_force
 from kjax.robots import go1
-from kjax.types import GRAVITY, MODE_ALPHA
+from kjax.types import GRAVITY
 from kjax.walkable import build_gaits, check_walkable
 
 HEAVY = go1.PARAMS._replace(
@@ -35,7 +35,7 @@ def test_the_defaults_and_the_shipped_configs_are_not_complained_of(repository):
 
 def test_bounds_that_cannot_carry_the_weight_name_their_key_and_what_is_needed():
     """2 x 160 N under 83 kg: half a second of trot takes 83 x 9.81 x 0.5 = 407 N s."""
-    text = r"lmpc\.force_z_max: in a cycle of trot \(0\.5 s\) the feet can give 160 N s, and 488"
+    text = r"gaits\.trot\.force_z_max: in a cycle of trot \(0\.5 s\) the feet can give 160 N s"
     with pytest.raises(ValueError, match=text):
         check_walkable(RunConfig(), HEAVY)
     with pytest.raises(ValueError, match=text):
@@ -43,21 +43,60 @@ def test_bounds_that_cannot_carry_the_weight_name_their_key_and_what_is_needed()
     check_walkable(config(lmpc__force_z_max=500.0), HEAVY)
 
 
-@pytest.mark.parametrize(("horizon", "key"), [("stance", "bound"), ("multiphase", "multiphase")])
-def test_a_bound_is_measured_by_the_bounds_that_its_horizon_uses(horizon, key):
+@pytest.mark.parametrize("name", ["bound", "bound_multiphase"])
+def test_a_gait_is_measured_by_its_own_bounds(name):
     """0.35 s of 12.74 kg, 1.2 times: 52.5 N s out of 0.15 s of two feet: 175 N."""
-    keys = {"gait.names": ["bound"], "bound.horizon": horizon, f"{key}.force_z_max": 174.0}
-    with pytest.raises(ValueError, match=rf"{key}\.force_z_max: in a cycle of bound"):
-        check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
-    check_walkable(load_config(RunConfig, None, keys | {f"{key}.force_z_max": 176.0}), go1.PARAMS)
+    keys, key = {"gait.names": [name]}, f"gaits.{name}.force_z_max"
+    with pytest.raises(ValueError, match=rf"{key}: in a cycle of {name} \(0\.35 s\)"):
+        check_walkable(load_config(RunConfig, None, keys | {key: 174.0}), go1.PARAMS)
+    check_walkable(load_config(RunConfig, None, keys | {key: 176.0}), go1.PARAMS)
 
 
-@pytest.mark.parametrize(("gait", "key"), [("trot", "lmpc"), ("bound", "bound")])
+@pytest.mark.parametrize(("gait", "key"), [("trot", "lmpc"), ("bound", "gaits.bound")])
 @pytest.mark.parametrize("height", [0.05, 0.50])
 def test_a_height_that_the_legs_do_not_reach_is_refused(gait, key, height):
     keys = {"gait.names": [gait], f"{key}.height": height}
-    with pytest.raises(ValueError, match=rf"{key}\.height is {height} m; the legs reach"):
+    with pytest.raises(ValueError, match=rf"gaits\.{gait}\.height is {height} m; the legs reach"):
         check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({"gaits.trot.period": 0.008}, r"trot: .* a stance of FR, RL of 0\.004 s, .* 0\.005 s"),
+        ({"gaits.bound.duty": [0.01, 0.01, 0.14, 0.14]}, r"bound: .* stance of FR, FL of 0\.0035"),
+        (
+            {"gaits.bound.ramp_start": 0.04},
+            r"bound: .* flight times ramp_start of 0\.004 s, shorter than lmpc\.control_dt",
+        ),
+        ({"lmpc.control_dt": 0.06, "gaits.bound.ramp_cycles": 0},
+         r"bound: .* stance of RR, RL of 0\.05 s, shorter"),
+        ({"gait.names": ["flying_trot"], "gaits.flying_trot.duty": [0.495] * 4},
+         r"flying_trot: .* flight of 0\.003 s"),
+        ({"gaits.bound.leave_through": "landing", "gaits.landing.period": 0.002},
+         r"landing: .* of 0\.002 s"),
+        (
+            {"gait.names": ["own"], "gaits.own.horizon": "multiphase", "gaits.own.feet_front": 0.1,
+             "gaits.own.feet_rear": 0.1},
+            r"own\.horizon = 'multiphase' takes no phase in which front and rear legs stand",
+        ),
+        ({"gaits.trot.reference": "periodic"}, r"trot\.reference = 'periodic' needs .* lift off"),
+        ({"gaits.trot.switch_rule": "first_flight"}, r"trot\.switch_rule = .* has no flight"),
+    ],
+)  # fmt: skip
+def test_a_timing_that_cannot_be_walked_names_its_gait(keys, text):
+    with pytest.raises(ValueError, match=rf"gaits\.{text}"):
+        check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
+
+
+def test_phases_as_short_as_a_tick_are_allowed():
+    """A flight need only reach the tick at its shortest, where its ramp begins."""
+    keys = {"gaits.bound.period": 0.03, "gaits.bound.offset": [0.0, 0.0, 0.5, 0.5],
+            "gaits.bound.duty": [1 / 6] * 4, "gaits.bound.ramp_start": 0.5}  # fmt: skip
+    config = load_config(RunConfig, None, keys)
+    check_walkable(config, go1.PARAMS)
+    (bound,) = [one for one in build_gaits(config) if one.name == "bound"]
+    np.testing.assert_allclose(bound.durations(0), 0.005, rtol=1e-9)
 
 
 def test_another_mass_than_the_robots_is_warned_of_and_a_wrong_one_refused():
@@ -72,9 +111,14 @@ def test_another_mass_than_the_robots_is_warned_of_and_a_wrong_one_refused():
     ("key", "refused", "taken", "text"),
     [
         # Two feet of at least 80 N over all of a trot are more than 125 N of weight; 12.74 kg.
-        ("lmpc.force_z_min", 80.0, 50.0, r"trot \(0\.5 s\) the feet give at least 80 N s, and"),
+        (
+            "gaits.trot.force_z_min",
+            80.0,
+            50.0,
+            r"trot \(0\.5 s\) the feet give at least 80 N s",
+        ),
         # Over 0.35 s of a bound the weight is 43.7 N s, in 0.15 s of two feet: 146 N each.
-        ("multiphase.force_z_min", 146.0, 100.0, "bound"),
+        ("gaits.bound_multiphase.force_z_min", 146.0, 100.0, "bound"),
         # A calf of 0.213 m under a hip at 0.27 m: 35.55 N m hold about 230 N on one leg.
         ("lmpc.torque_fraction", 0.3, 0.4, "trot"),
         ("multiphase.torque_fraction", 0.3, 0.9, "bound"),
@@ -82,7 +126,7 @@ def test_another_mass_than_the_robots_is_warned_of_and_a_wrong_one_refused():
 )
 def test_forces_that_cannot_balance_the_weight_name_their_key(key, refused, taken, text):
     """The least ones lift the robot; what the joints can press does not carry it."""
-    own = {"gait.names": ["bound"], "bound.horizon": "multiphase"} if "multi" in key else {}
+    own = {"gait.names": ["bound_multiphase"]} if "multi" in key else {}
     with pytest.raises(ValueError, match=rf"{key}: in a cycle of {text}"):
         check_walkable(load_config(RunConfig, None, own | {key: refused}), go1.PARAMS)
     check_walkable(load_config(RunConfig, None, own | {key: taken}), go1.PARAMS)
@@ -129,24 +173,28 @@ def test_contact_points_that_no_foot_can_have_are_refused(key, point, text):
     "keys",
     [
         {},
-        {"gait.trot_flight": 0.1},
+        {"gait.names": ["flying_trot"]},
         {"gait.names": ["bound"]},
-        {"gait.names": ["bound"], "bound.feet_front": 0.10, "bound.front_stance": 0.08},
+        {"gait.names": ["bound"], "gaits.bound.feet_front": 0.10, "gaits.bound.period": 0.4},
+        {"gait.names": ["pronk"]},
+        {"gait.names": ["walk"]},
+        {"gait.names": ["pace"]},
     ],
 )
 def test_the_mean_force_carries_the_weight_over_a_cycle_and_turns_nothing(keys):
     chosen = load_config(RunConfig, None, keys)
-    (gait,) = [g for g in build_gaits(chosen) if g.name == chosen.gait.names[0]]
-    force = np.asarray(mean_force(chosen, 12.0))
-    impulses = np.array([p.duration * MODE_ALPHA[p.mode] * force[p.mode] for p in gait.phases])
-    period = sum(p.duration for p in gait.phases)
-    np.testing.assert_allclose(impulses.sum(), 12.0 * GRAVITY * period, rtol=1e-12)
-    if gait.name == "bound":
-        levers = np.array([chosen.bound.feet_front, -chosen.bound.feet_rear])
-        # Rounding of impulses of 20 N s at 0.15 m.
-        assert abs((impulses.sum(axis=0) * levers).sum()) < 1e-12
+    gaits = build_gaits(chosen)
+    (index,) = [i for i, one in enumerate(gaits) if one.name == chosen.gait.names[0]]
+    force = np.asarray(mean_force(gaits, chosen, 12.0))[index]
+    legs = np.array([np.reshape(p.stance, (2, 2)).sum(axis=1) for p in gaits[index].phases])
+    impulses = np.array([p.duration for p in gaits[index].phases])[:, None] * legs * force
+    np.testing.assert_allclose(impulses.sum(), 12.0 * GRAVITY * gaits[index].period, rtol=1e-12)
+    own = chosen.gaits[gaits[index].name]
+    levers = np.array([own.feet_front or 0.2, -(own.feet_rear or 0.2)])
+    # Rounding of impulses of 60 N s at 0.2 m.
+    assert abs((impulses.sum(axis=0) * levers).sum()) < 1e-11
 
 
 def test_the_papers_reference_is_no_force():
-    force = mean_force(config(lmpc__input_reference="zero"), 12.0)
-    np.testing.assert_array_equal(force, 0.0)
+    chosen = config(lmpc__input_reference="zero")
+    np.testing.assert_array_equal(mean_force(build_gaits(chosen), chosen, 12.0), 0.0)

@@ -5,14 +5,14 @@ Every field's docstring ends with its unit in brackets; ``--help`` of the experi
 
 from kjax.config.checks import Tunable
 from kjax.config.control import (
-    BoundConfig,
     CommandConfig,
-    GaitConfig,
+    GaitTimesConfig,
     LateralConfig,
     LegConfig,
     LmpcConfig,
     MultiPhaseConfig,
 )
+from kjax.config.gaits import GaitConfig, Gaits
 from kjax.config.loading import ConfigError, Overlay, fields, load_config, to_dict, tunable
 from kjax.config.model import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.config.run import FitStudyConfig, RunConfig
@@ -21,13 +21,14 @@ from kjax.config.sweep import AxisConfig, FigureConfig, SweepConfig
 
 __all__ = [
     "AxisConfig",
-    "BoundConfig",
     "CommandConfig",
     "ConfigError",
     "DatasetConfig",
     "FigureConfig",
     "FitStudyConfig",
     "GaitConfig",
+    "GaitTimesConfig",
+    "Gaits",
     "KoopmanConfig",
     "LateralConfig",
     "LegConfig",

@@ -1,7 +1,8 @@
 """What the sections share: strictness, kinds of numbers, and checks across keys."""
 
+import difflib
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Annotated, Any
@@ -83,3 +84,12 @@ def require_fraction(config: Any) -> None:
         raise ValueError(
             f"torque_fraction must be at most 1, or inf for no rows, got {config.torque_fraction}"
         )
+
+
+def require_name(key: str, name: str, known: Iterable[str]) -> None:
+    """Refuse a name that is none of those known, with the nearest of them."""
+    known = list(known)
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        raise ValueError(f"{key}: got '{name}', wanted one of {', '.join(known)}{hint}")

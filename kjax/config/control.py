@@ -7,7 +7,6 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from kjax.config.checks import (
-    FOOT_DISTANCE,
     FORCE,
     GAIN,
     HEIGHT,
@@ -63,7 +62,7 @@ class CommandConfig:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LmpcConfig:
-    """Linear MPC on the lifted models."""
+    """Linear MPC on the lifted models; weights and bounds of gaits that give none of their own."""
 
     control_dt: Positive = 0.005
     """Time between two plans [s]."""
@@ -125,102 +124,29 @@ class LmpcConfig:
         return self
 
 
-GaitName = Literal["trot", "bound", "stand"]
-
-
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class GaitConfig:
+class GaitTimesConfig:
     """Which gait when."""
 
-    names: tuple[GaitName, ...] = ("trot",)
-    """Gaits to walk in, one after the other [-]."""
+    names: tuple[str, ...] = ("trot",)
+    """Gaits to walk in, one after the other: names of [gaits] [-]."""
     times: tuple[NonNegative, ...] = (0.0,)
     """When each of them is asked for, increasing, the first one 0 [s]."""
-    stance_time: Positive = 0.25
-    """Duration of each trot stance; the other diagonal swings meanwhile [s]."""
-    trot_flight: NonNegative = 0.0
-    """Flight after each trot stance; more than 0 makes a flying trot [s]."""
-    switch_rule: Literal["flight", "anywhere"] = "flight"
-    """When a bound may be left: in the flight after front stance (Raibert), or at once [-]."""
-    landing_time: NonNegative = 0.0
-    """Four-leg stance between a bound and the next gait [s]."""
+    also: tuple[str, ...] = ("trot", "bound", "stand")
+    """Gaits that are compiled besides, so that they may be asked for while it runs [-]."""
 
     @model_validator(mode="after")
-    def _check(self) -> "GaitConfig":
+    def _check(self) -> "GaitTimesConfig":
         require_timeline(self.times, "names", self.names)
         return self
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class BoundConfig:
-    """The bound: timing, feet, reference, and its own LMPC weights and bounds."""
-
-    front_stance: Positive = 0.1
-    """Duration of the front stance [s]."""
-    first_flight: Positive = 0.1
-    """Duration of the flight after it [s]."""
-    rear_stance: Positive = 0.05
-    """Duration of the rear stance [s]."""
-    second_flight: Positive = 0.1
-    """Duration of the flight after it [s]."""
-    ramp_start: Annotated[float, Field(gt=0, le=1)] = 0.3
-    """Length of the flights in the first cycle, as a fraction of the full one [-]."""
-    ramp_cycles: Annotated[int, Field(ge=0)] = 10
-    """Number of cycles over which the flights grow to their full length [-]."""
-    feet_front: Annotated[Positive, FOOT_DISTANCE] = 0.075
-    """Distance of the front footholds ahead of the centre of mass, standing still [m]."""
-    feet_rear: Annotated[Positive, FOOT_DISTANCE] = 0.148
-    """Distance of the rear footholds behind the centre of mass, standing still [m]."""
-    horizon: Literal["stance", "multiphase"] = "stance"
-    """What the prediction covers: the present stance (the paper), or a whole cycle ([multiphase],
-    which then has the weights and bounds) [-]."""
-    reference: Literal["periodic", "constant"] = "periodic"
-    """Reference of height and pitch: the cycle's own motion, or constant (the paper) [-]."""
-    force_edge: Annotated[float, Field(gt=0, le=0.5), Tunable(low=0.02, high=0.5)] = 0.25
-    """Part of a stance in which the periodic reference's force rises, and again falls [-]."""
-    height: Annotated[Positive, HEIGHT] = 0.27
-    """Mean height of the centre of mass in stance [m]."""
-    state_weights: Annotated[
-        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], WEIGHT
-    ] = (1084.0, 1211.0, 60.0, 3.06, 3.05, 0.1)
-    """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
-    input_weight: Annotated[Positive, WEIGHT] = 5.7e-7
-    """R of every force [1/N^2]."""
-    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 51.5
-    """Bound of |F_x| per leg, body frame [N]."""
-    force_z_min: Annotated[Bound, MIN_FORCE] = 20.0
-    """Lower bound of F_z per leg: a foot that carries no weight slips [N]."""
-    force_z_max: Annotated[Bound, FORCE] = 300.0
-    """Upper bound of F_z per leg, body frame [N]."""
-    velocity_gain: Annotated[NonNegative, GAIN] = 0.075
-    """Raibert gain on the velocity error in the foothold [s]."""
-    apex: Positive = 0.064
-    """Height of the swing above the higher of lift-off and target [m]."""
-
-    @model_validator(mode="after")
-    def _check(self) -> "BoundConfig":
-        require_order(self)
-        return self
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
 class MultiPhaseConfig:
-    """LMPC of the bound over one gait cycle, through flight; for bound.horizon = "multiphase"."""
+    """LMPC over one gait cycle, through flight; for gaits whose horizon is "multiphase"."""
 
     node_dt: Positive = 0.0125
     """Longest node of a stance; a flight is one node [s]."""
-    state_weights: Annotated[
-        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], WEIGHT
-    ] = (63.6, 190.0, 10.4, 29.0, 1.57, 0.22)
-    """Q of (p_x, p_z, theta, v_x, v_z, omega), per second [1/s times that of bound]."""
-    input_weight: Annotated[Positive, WEIGHT] = 5.26e-5
-    """R of every force's distance from the periodic one, per second [1/(N^2 s)]."""
-    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 90.0
-    """Bound of |F_x| per leg, world frame [N]."""
-    force_z_min: Bound = 10.0
-    """Lower bound of F_z per leg, world frame [N]."""
-    force_z_max: Bound = 340.0
-    """Upper bound of F_z per leg, world frame [N]."""
     friction: Annotated[float, Field(ge=0.05)] = 0.6
     """mu of the pyramid |F_x| <= mu F_z; below the ground's, for margin [-]."""
     torque_fraction: Annotated[float, Field(gt=0, le=1)] = 0.95
@@ -235,11 +161,6 @@ class MultiPhaseConfig:
     """Relative residuals and gap at which the QP counts as solved [-]."""
     max_iterations: Count = 30
     """Iteration limit of the QP [-]."""
-
-    @model_validator(mode="after")
-    def _check(self) -> "MultiPhaseConfig":
-        require_order(self)
-        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,12 +12,47 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from kjax.config.checks import Tunable
+from kjax.config.gaits import LIBRARY, GaitConfig, Gaits, completed, dump_used, used
 
 T = TypeVar("T")
 
 
 # What has become of keys of earlier versions.
+_BOUND = "is now [gaits.bound] (or gaits.bound_multiphase, which predicts through flight)"
 RETIRED = {
+    **{
+        f"bound.{key}": f"{_BOUND}: set its period, offset and duty"
+        for key in ("front_stance", "first_flight", "rear_stance", "second_flight")
+    },
+    **{
+        f"bound.{key}": f"is now gaits.bound.{key}"
+        for key in (
+            "ramp_start",
+            "ramp_cycles",
+            "feet_front",
+            "feet_rear",
+            "reference",
+            "force_edge",
+            "height",
+            "state_weights",
+            "input_weight",
+            "force_x_max",
+            "force_z_min",
+            "force_z_max",
+            "velocity_gain",
+            "apex",
+        )
+    },
+    "bound.horizon": "has gone: the gait bound_multiphase predicts through flight (gait.names)",
+    **{
+        f"multiphase.{key}": f"is now gaits.bound_multiphase.{key}"
+        for key in ("state_weights", "input_weight", "force_x_max", "force_z_min", "force_z_max")
+    },
+    "gait.stance_time": "has gone: set gaits.trot.period and gaits.trot.duty",
+    "gait.trot_flight": "has gone: the gait flying_trot has flights (gait.names)",
+    "gait.switch_rule": "is now gaits.bound.switch_rule: 'anywhere', 'first_flight', 'cycle_end'",
+    "gait.landing_time": "has gone: set gaits.bound.leave_through = 'landing' and "
+    "gaits.landing.period",
     "command.velocities": "is now command.v_x",
     "lmpc.height_above": "is no key any more: heights are measured from the stance feet",
     "lateral.friction_offset": "is no key any more: lateral.friction bounds the horizontal force",
@@ -35,19 +70,28 @@ class ConfigError(ValueError):
 def fields(cls: type, prefix: str = "") -> Iterator[tuple[str, FieldInfo, Any]]:
     """Leaf keys of a config class as (dotted name, field, default)."""
     for name, info in cls.__pydantic_fields__.items():  # type: ignore[attr-defined]
-        if dataclasses.is_dataclass(info.annotation):
+        if info.annotation is Gaits:
+            for gait, own in LIBRARY.items():
+                for key, entry, _ in fields(GaitConfig, f"{prefix}{name}.{gait}."):
+                    yield key, entry, getattr(own, key.rsplit(".", 1)[1])
+        elif dataclasses.is_dataclass(info.annotation):
             yield from fields(info.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
         else:
             yield f"{prefix}{name}", info, info.default
 
 
-def tunable(cls: type) -> dict[str, Tunable]:
-    """Keys of a config class that may be tuned, and how."""
+def tunable(cls: type, gaits: Iterable[str] = ()) -> dict[str, Tunable]:
+    """Keys of a config class that may be tuned, and how.
+
+    Args:
+      cls: config class.
+      gaits: names of a config's own gaits, besides the library's.
+    """
+    keys = [(name, info) for name, info, _ in fields(cls)]
+    for gait in gaits:
+        keys += [(name, info) for name, info, _ in fields(GaitConfig, f"gaits.{gait}.")]
     return {
-        name: mark
-        for name, info, _ in fields(cls)
-        for mark in info.metadata
-        if isinstance(mark, Tunable)
+        name: mark for name, info in keys for mark in info.metadata if isinstance(mark, Tunable)
     }
 
 
@@ -67,8 +111,13 @@ class Overlay:
             for key, value in self._values.items()
             if key.startswith(f"{name}.")
         }
-        own = getattr(self._config, name)
+        held = self._config
+        own = held[name] if isinstance(held, Mapping) else getattr(held, name)
         return Overlay(own, inside) if inside else own
+
+    def __getitem__(self, name: str) -> Any:
+        """Likewise, of a mapping such as ``gaits``."""
+        return self.__getattr__(name)
 
 
 def load_config(
@@ -106,6 +155,8 @@ def load_config(
             if not isinstance(node, dict):
                 raise ConfigError(f"{source}: {key}: '{section}' is a value, not a section")
         node[leaf] = value
+    if "gaits" in data:
+        data["gaits"] = completed(data["gaits"])
     try:
         # Through JSON, since strict mode then takes lists for tuples but still no "3" for 3.
         return TypeAdapter(cls).validate_json(json.dumps(data, default=str), strict=True)
@@ -127,6 +178,10 @@ def _explain(error: ValidationError, cls: type) -> str:
     if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         if key in RETIRED:
             return f"{key}: {RETIRED[key]}"
+        inner = [old for old in RETIRED if old.startswith(f"{key}.")]
+        if inner and isinstance(came, Mapping):  # a section that has gone
+            old = next((o for o in inner if o.split(".", 1)[1] in came), inner[0])
+            return f"{old}: {RETIRED[old]}"
         names = {name for name, _, _ in fields(cls)}
         names |= {name.rsplit(".", 1)[0] for name in names if "." in name}
         near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
@@ -163,4 +218,7 @@ def _nearest_file(path: Path) -> str:
 
 def to_dict(config: Any) -> dict[str, Any]:
     """The config as nested plain data (lists for tuples), ready for TOML or JSON."""
-    return TypeAdapter(type(config)).dump_python(config, mode="json")
+    data: dict[str, Any] = TypeAdapter(type(config)).dump_python(config, mode="json")
+    if "gaits" in data:
+        data["gaits"] = dump_used(config.gaits, used(config.gaits, config.gait.names))
+    return data

@@ -3,16 +3,16 @@
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from kjax.config.checks import STRICT, Count, Positive, require_multiple
+from kjax.config.checks import STRICT, Count, Positive, require_multiple, require_name
 from kjax.config.control import (
-    BoundConfig,
     CommandConfig,
-    GaitConfig,
+    GaitTimesConfig,
     LateralConfig,
     LegConfig,
     LmpcConfig,
     MultiPhaseConfig,
 )
+from kjax.config.gaits import Gaits, setting
 from kjax.config.model import KoopmanConfig, SrbConfig
 from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
 
@@ -33,12 +33,12 @@ class RunConfig:
     """Prediction models."""
     lmpc: LmpcConfig = LmpcConfig()
     """Model predictive control."""
-    gait: GaitConfig = GaitConfig()
-    """Gait."""
-    bound: BoundConfig = BoundConfig()
-    """Bound."""
+    gait: GaitTimesConfig = GaitTimesConfig()
+    """Which gait when."""
+    gaits: Gaits = Gaits()
+    """The gaits."""
     multiphase: MultiPhaseConfig = MultiPhaseConfig()
-    """Multi-phase horizon of the bound."""
+    """Horizon through flight."""
     leg: LegConfig = LegConfig()
     """Swing legs."""
     lateral: LateralConfig = LateralConfig()
@@ -70,25 +70,17 @@ class RunConfig:
                 f"duration is {self.duration} s, shorter than lmpc.control_dt "
                 f"{self.lmpc.control_dt} s"
             )
-        bound = self.bound
-        shortest = {
-            "gait.stance_time": self.gait.stance_time,
-            "bound.front_stance": bound.front_stance,
-            "bound.rear_stance": bound.rear_stance,
-            "bound.first_flight times ramp_start": bound.first_flight * bound.ramp_start,
-            "bound.second_flight times ramp_start": bound.second_flight * bound.ramp_start,
-        }
-        for name, value in (
-            ("gait.trot_flight", self.gait.trot_flight),
-            ("gait.landing_time", self.gait.landing_time),
-        ):
-            if value > 0:
-                shortest[name] = value
-        for name, value in shortest.items():
-            if value < self.lmpc.control_dt:
+        for key, names in (("names", self.gait.names), ("also", self.gait.also)):
+            for name in names:
+                require_name(f"gait.{key}", name, self.gaits)
+        for name, one in self.gaits.items():
+            low, high = (setting(self, name, f"force_z_{end}") for end in ("min", "max"))
+            if not low <= high:
                 raise ValueError(
-                    f"{name} is {value} s, shorter than lmpc.control_dt {self.lmpc.control_dt} s"
+                    f"gaits.{name}: force_z_min must not exceed force_z_max, got {low} and {high}"
                 )
+            if one.leave_through:
+                require_name(f"gaits.{name}.leave_through", one.leave_through, self.gaits)
         return self
 
 

@@ -7,15 +7,13 @@ from kjax.gait.schedule import (
     Preview,
     Schedule,
     advance,
-    bound,
     build_schedule,
     flight_scale,
     phase_duration,
+    phases,
     preview,
-    stand,
     start,
     time_to_touchdown,
-    trot,
 )
 
 __all__ = [
@@ -25,13 +23,11 @@ __all__ = [
     "Preview",
     "Schedule",
     "advance",
-    "bound",
     "build_schedule",
     "flight_scale",
     "phase_duration",
+    "phases",
     "preview",
-    "stand",
     "start",
     "time_to_touchdown",
-    "trot",
 ]

@@ -1,12 +1,15 @@
-"""Periodic reference of a bound: height, pitch and their rates through one cycle.
+"""Periodic reference of a gait with flights: height, pitch and their rates through one cycle.
 
-In a bound no constant pose is consistent with the forces: each stance lifts and turns the body and
-each flight lets it fall. The reference is the periodic motion of the rigid body under trapezoidal
-vertical forces whose impulses carry the weight over a cycle and leave no net turn:
+In a bound or a pronk no constant pose is consistent with the forces: each stance lifts and turns
+the body and each flight lets it fall. The reference is the periodic motion of the rigid body under
+trapezoidal vertical forces whose impulses carry the weight over a cycle and leave no net turn:
 
     J_f + J_r = m g T,   J_f l_f = J_r l_r
+
+An end that stands several times in a cycle shares its impulse among its stances by their length.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -32,6 +35,13 @@ class PeriodicReference(NamedTuple):
     impulses: Float[Array, "2"]
 
 
+def has_periodic_reference(modes: Sequence[Mode]) -> bool:
+    """Whether front and rear both stand in a cycle, and neither does in two phases on end."""
+    stands = MODE_ALPHA[list(modes)] > 0
+    twice = stands & np.roll(stands, -1, axis=0)
+    return bool(stands.any(axis=0).all() and not twice.any())
+
+
 def periodic_reference(
     durations: np.ndarray,
     modes: list[Mode],
@@ -41,7 +51,7 @@ def periodic_reference(
     inertia: Any,
     edge: Any = 0.25,
 ) -> PeriodicReference:
-    """Periodic reference of a cycle of front, rear and flight phases.
+    """Periodic reference of a cycle in which each end has left the ground before it stands again.
 
     Differentiable by all but the durations and modes.
 
@@ -55,12 +65,11 @@ def periodic_reference(
       edge: part of a stance in which the force rises, and again in which it falls, up to 1/2 [-].
 
     Raises:
-      ValueError: where front and rear do not both stand exactly once per cycle.
+      ValueError: where an end never stands, or does in two phases on end.
     """
-    front = [i for i, mode in enumerate(modes) if MODE_ALPHA[mode, 0] > 0]
-    rear = [i for i, mode in enumerate(modes) if MODE_ALPHA[mode, 1] > 0]
-    if len(front) != 1 or len(rear) != 1 or front == rear:
-        raise ValueError(f"a bound has one front and one rear stance per cycle, got {modes}")
+    if not has_periodic_reference(modes):
+        raise ValueError(f"front and rear must stand, and lift off after each phase, got {modes}")
+    ends = [[i for i, mode in enumerate(modes) if MODE_ALPHA[mode, end] > 0] for end in (0, 1)]
     total = mass * GRAVITY * float(np.sum(durations))
     impulses = jnp.stack([lever_rear * total, lever_front * total]) / (lever_front + lever_rear)
 
@@ -71,21 +80,19 @@ def periodic_reference(
     shape /= shape.mean()
     force = jnp.zeros((len(modes), cells))
     moment = jnp.zeros_like(force)
-    for i, impulse, lever in (
-        (front[0], impulses[0], lever_front),
-        (rear[0], impulses[1], -lever_rear),
-    ):
-        pushed = shape * impulse / durations[i]
-        force = force.at[i].set(pushed)
-        moment = moment.at[i].set(lever * pushed)  # ahead of the body it turns the nose up
+    for end, impulse, lever in zip(ends, impulses, (lever_front, -lever_rear), strict=True):
+        pushed = shape * impulse / sum(durations[i] for i in end)
+        for i in end:
+            force = force.at[i].add(pushed)
+            moment = moment.at[i].add(lever * pushed)  # ahead of the body it turns the nose up
     step = np.repeat(np.asarray(durations) / cells, cells)
     z, v_z = _periodic(force.reshape(-1) / mass - GRAVITY, step)
     theta, omega = _periodic(moment.reshape(-1) / inertia, step)
 
-    # The mean over the two stances is zero: that is where the height reference refers to, and
+    # The mean over the stances is zero: that is where the height reference refers to, and
     # the trunk is level on average while it can be acted on.
     at = np.arange(len(modes))[:, None] * cells + np.arange(SAMPLES) * (cells // (SAMPLES - 1))
-    stances = at[[front[0], rear[0]]]
+    stances = at[[i for i, mode in enumerate(modes) if mode != Mode.FLIGHT]]
     z, theta = (a - a[stances].mean() for a in (z, theta))
     rows = jnp.stack([z[at], theta[at], v_z[at], omega[at]], axis=-1)
     return PeriodicReference(rows=rows, impulses=impulses)

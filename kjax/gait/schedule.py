@@ -5,31 +5,35 @@ Gaits are stacked on a leading axis and padded to one number of phases, so that 
 switching a gait is an index and never recompiles.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from kjax.types import Mode
+from kjax.types import Mode, contact_mode
+
+SwitchRule = Literal["anywhere", "first_flight", "cycle_end"]
 
 
 class Phase(NamedTuple):
-    """One phase of a gait.
+    """One phase of a gait: the same legs stand.
 
     Attributes:
       stance: whether each leg stands, order FR, FL, RR, RL.
-      mode: contact mode.
       duration: [s].
-      may_leave: whether a switch to another gait may happen during this phase.
     """
 
     stance: tuple[bool, bool, bool, bool]
-    mode: Mode
     duration: float
-    may_leave: bool = True
+
+    @property
+    def flies(self) -> bool:
+        """Whether no leg stands."""
+        return not any(self.stance)
 
 
 class Gait(NamedTuple):
@@ -40,7 +44,8 @@ class Gait(NamedTuple):
       phases: in order.
       ramp_start: flights begin at this fraction of their length and grow to all of it [-].
       ramp_cycles: over so many cycles; 0 for no ramp.
-      leave_when_done: a switch waits for the end of the phase.
+      switch_rule: when it may be left: "anywhere", as the "first_flight" of its cycle begins, or at
+        the "cycle_end".
       leave_through: name of the gait in between when this one is left; itself for none.
     """
 
@@ -48,14 +53,63 @@ class Gait(NamedTuple):
     phases: tuple[Phase, ...]
     ramp_start: float = 1.0
     ramp_cycles: int = 0
-    leave_when_done: bool = False
+    switch_rule: SwitchRule = "anywhere"
     leave_through: str = ""
+
+    @property
+    def period(self) -> float:
+        """Length of a cycle, flights at full length [s]."""
+        return sum(phase.duration for phase in self.phases)
 
     def durations(self, cycle: int) -> list[float]:
         """Length of each phase in a cycle, counted from the gait's beginning [s]."""
         grown = min(cycle / self.ramp_cycles, 1.0) if self.ramp_cycles else 1.0
         scale = self.ramp_start + (1.0 - self.ramp_start) * grown
-        return [p.duration * (scale if p.mode == Mode.FLIGHT else 1.0) for p in self.phases]
+        return [p.duration * (scale if p.flies else 1.0) for p in self.phases]
+
+    def may_leave(self) -> list[bool]:
+        """Whether a switch to another gait may happen during each phase."""
+        if self.switch_rule == "anywhere":
+            return [True] * len(self.phases)
+        at = 0
+        if self.switch_rule == "first_flight":
+            flights = [i for i, phase in enumerate(self.phases) if phase.flies]
+            if not flights:
+                raise ValueError(f"{self.name} has no flight that it could be left in")
+            at = flights[0]
+        return [i == at for i in range(len(self.phases))]
+
+
+def phases(period: float, offset: Sequence[float], duty: Sequence[float]) -> tuple[Phase, ...]:
+    """Phases of a cycle from when each leg touches down and how long it stands.
+
+    Args:
+      period: of the cycle [s].
+      offset: (4,) touchdown of each leg, part of the cycle [-].
+      duty: (4,) part of the cycle in which it stands, from there on; 1 for always [-].
+
+    Returns:
+      Those between touchdowns and lift-offs in order, from the first of these at or after the
+      cycle's beginning on.
+    """
+    same = 1e-9  # parts of a cycle that rounding leaves between two events at once
+    events: list[float] = []
+    for begin, length in zip(offset, duty, strict=True):
+        for event in (begin, begin + length) if length < 1.0 - same else ():
+            at = event % 1.0
+            at = 0.0 if at > 1.0 - same else at
+            if all(abs(at - other) > same for other in events):
+                events.append(at)
+    events = sorted(events) or [0.0]
+    out = []
+    for at, until in itertools.pairwise([*events, events[0] + 1.0]):
+        middle = 0.5 * (at + until)
+        stands = [
+            (middle - begin) % 1.0 < length for begin, length in zip(offset, duty, strict=True)
+        ]
+        fr, fl, rr, rl = stands
+        out.append(Phase((fr, fl, rr, rl), (until - at) * period))
+    return tuple(out)
 
 
 class Schedule(NamedTuple):
@@ -108,65 +162,6 @@ class Clock(NamedTuple):
     elapsed: Float[Array, ""]
 
 
-def trot(stance_time: float, flight_time: float = 0.0) -> Gait:
-    """Diagonal pairs FR-RL and FL-RR in turn, ``stance_time`` [s] each; a flying trot with flight.
-
-    Args:
-      stance_time: of each diagonal [s].
-      flight_time: after each stance [s].
-    """
-    first, second = (True, False, False, True), (False, True, True, False)
-    air = Phase((False,) * 4, Mode.FLIGHT, flight_time)
-    phases = [Phase(first, Mode.TROT, stance_time), air, Phase(second, Mode.TROT, stance_time), air]
-    return Gait("trot", tuple(phase for phase in phases if phase.duration > 0))
-
-
-def stand(duration: float = 1.0, name: str = "stand") -> Gait:
-    """All four feet down; as a landing between two gaits it lasts ``duration`` [s]."""
-    phase = Phase((True,) * 4, Mode.STAND, duration)
-    return Gait(name, (phase,), leave_when_done=name != "stand")
-
-
-def bound(
-    front_stance: float,
-    first_flight: float,
-    rear_stance: float,
-    second_flight: float,
-    *,
-    ramp_start: float,
-    ramp_cycles: int,
-    leave_anywhere: bool = False,
-    leave_through: str = "",
-) -> Gait:
-    """Front stance, flight, rear stance, flight.
-
-    Args:
-      front_stance: [s].
-      first_flight: after it [s].
-      rear_stance: [s].
-      second_flight: after it [s].
-      ramp_start: see ``Gait``.
-      ramp_cycles: see ``Gait``.
-      leave_anywhere: allow a switch at any time; else as the first flight begins only (Raibert's
-        rule: no foot is kicked into the ground that carries no weight).
-      leave_through: see ``Gait``.
-    """
-    front, rear, none = (True, True, False, False), (False, False, True, True), (False,) * 4
-    return Gait(
-        "bound",
-        (
-            Phase(front, Mode.FRONT, front_stance, leave_anywhere),
-            Phase(none, Mode.FLIGHT, first_flight, True),
-            Phase(rear, Mode.REAR, rear_stance, leave_anywhere),
-            Phase(none, Mode.FLIGHT, second_flight, leave_anywhere),
-        ),
-        ramp_start=ramp_start,
-        ramp_cycles=ramp_cycles,
-        leave_when_done=not leave_anywhere,
-        leave_through=leave_through,
-    )
-
-
 def build_schedule(gaits: list[Gait]) -> Schedule:
     """Stack gaits into one schedule; works out touchdown and stance times per leg."""
     if not gaits or not all(gait.phases for gait in gaits):
@@ -181,19 +176,22 @@ def build_schedule(gaits: list[Gait]) -> Schedule:
     padded = max(len(gait.phases) for gait in gaits)
     rows = [[(g.phases, min(i, len(g.phases) - 1)) for i in range(padded)] for g in gaits]
 
+    leave = [gait.may_leave() for gait in gaits]
+    leave = [[row[min(i, len(row) - 1)] for i in range(padded)] for row in leave]
+
     def table(value: Callable[[tuple[Phase, ...], int], Any], kind: type = float) -> Array:
         return jnp.asarray(np.array([[value(*entry) for entry in row] for row in rows], kind))
 
     return Schedule(
         phases=jnp.asarray([len(gait.phases) for gait in gaits]),
         duration=table(lambda phases, i: phases[i].duration),
-        mode=table(lambda phases, i: phases[i].mode, int),
+        mode=table(lambda phases, i: contact_mode(phases[i].stance), int),
         stance=table(lambda phases, i: phases[i].stance, bool),
         time_to_touchdown=table(_waits),
         flight_to_touchdown=table(_flights),
         stance_time=table(_stance_times),
-        may_leave=table(lambda phases, i: phases[i].may_leave, bool),
-        leave_when_done=jnp.asarray([gait.leave_when_done for gait in gaits]),
+        may_leave=jnp.asarray(np.array(leave)),
+        leave_when_done=jnp.asarray([gait.switch_rule != "anywhere" for gait in gaits]),
         leave_through=jnp.asarray([names.index(g.leave_through or g.name) for g in gaits]),
         ramp_start=jnp.asarray([gait.ramp_start for gait in gaits], float),
         ramp_cycles=jnp.asarray([gait.ramp_cycles for gait in gaits]),
@@ -222,7 +220,7 @@ def _flights(phases: tuple[Phase, ...], index: int) -> list[list[float]]:
         sums = [0.0, 0.0]
         for k in _phases_to_stance(phases, index, leg):
             phase = phases[k % len(phases)]
-            if phase.mode == Mode.FLIGHT:
+            if phase.flies:
                 sums[k // len(phases)] += phase.duration
         parts.append(sums)
     return parts

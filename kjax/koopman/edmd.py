@@ -7,7 +7,7 @@ columns scaled to unit norm, and an SVD of that small triangle reveals the rank.
 on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small steps.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -210,24 +210,32 @@ def build_dictionary(config: DictionarySpec | KoopmanConfig) -> Dictionary:
     )
 
 
-def srb_params(
-    config: SrbConfig, mode_feet: Mapping[Mode, tuple[Point, Point]] | None = None
-) -> srb.SrbParams:
-    """Body parameters of every contact mode, stacked on a leading axis.
+def srb_params(config: SrbConfig) -> srb.SrbParams:
+    """Body parameters, the same in every contact mode: stacked over ``types.Mode``.
 
     Args:
-      config: mass, inertia and the contact points of the modes that ``mode_feet`` leaves out; from
-        ``rigid_body.own_body``.
-      mode_feet: (front, rear) contact points (x, z) of single modes, body frame [m].
+      config: mass, inertia and contact points, from ``rigid_body.own_body``.
     """
     if config.mass is None or config.inertia is None:
         raise ValueError("srb.mass and srb.inertia are left out: see rigid_body.own_body")
-    feet = np.tile(np.array([config.feet_front, config.feet_rear], float), (len(Mode), 1, 1))
-    for mode, points in (mode_feet or {}).items():
-        feet[mode] = points
+    feet = np.array([config.feet_front, config.feet_rear], float)
+    return stack_bodies(config.mass, config.inertia, np.tile(feet, (len(Mode), 1, 1)))
+
+
+def stack_bodies(
+    mass: float, inertia: float, feet: Sequence[tuple[Point, Point]] | np.ndarray | Array
+) -> srb.SrbParams:
+    """Body parameters with a leading axis.
+
+    Args:
+      mass: [kg].
+      inertia: [kg m^2].
+      feet: (n, 2, 2) front and rear contact points (x, z), body frame [m].
+    """
+    count = len(feet)
     return srb.SrbParams(
-        mass=jnp.full(len(Mode), config.mass, float),
-        inertia=jnp.full(len(Mode), config.inertia, float),
+        mass=jnp.full(count, mass, float),
+        inertia=jnp.full(count, inertia, float),
         feet=jnp.asarray(feet, float),
     )
 
@@ -238,6 +246,7 @@ def fit_modes(
     key: PRNGKeyArray,
     *,
     ranges: SampleRanges | None = None,
+    modes: Sequence[Mode] = tuple(Mode),
 ) -> tuple[LinearModel, FitReport]:
     """One model per contact mode from random rollouts, all modes in one vmapped call.
 
@@ -247,9 +256,10 @@ def fit_modes(
       key: random key, usually of ``config.dataset.seed``; an argument, since XLA would evaluate
         the whole data set of a constant one while it compiles.
       ranges: sampling ranges in place of the config's.
+      modes: contact modes that ``body`` is stacked over; data of a mode are the same in any list.
 
     Returns:
-      Model and report, each with a leading axis over ``types.Mode``.
+      Model and report, each with a leading axis over ``modes``.
     """
     dictionary = build_dictionary(config)
     data = config.dataset
@@ -270,5 +280,6 @@ def fit_modes(
         )
         return fit(dictionary, snapshots, feet_terms=vary_feet)
 
-    keys = jax.random.split(key, len(MODE_ALPHA))
-    return jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA, float), body)
+    chosen = np.array(modes)
+    keys = jax.random.split(key, len(Mode))[chosen]
+    return jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA[chosen], float), body)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax import srb
@@ -19,11 +20,11 @@ from kjax.koopman.families import BodyModel, Family, ResidualModel
 from kjax.koopman.learned import learned
 from kjax.koopman.observables import states_only
 from kjax.spec import DictionarySpec, ModelSpec
-from kjax.types import INPUT_DIM, MODE_ALPHA, Mode
+from kjax.types import INPUT_DIM, MODE_ALPHA, STATE_DIM, Mode
 
 
 class Prediction(NamedTuple):
-    """Numbers of a prediction model, stacked over ``types.Mode``; data.
+    """Numbers of a prediction model, stacked over contact modes; data.
 
     Attributes:
       numbers: of the family.
@@ -81,7 +82,12 @@ def build_family(spec: ModelSpec) -> Family:
 
 
 def build_prediction(
-    body: srb.SrbParams, config: KoopmanConfig, key: PRNGKeyArray, *, height: float
+    body: srb.SrbParams,
+    config: KoopmanConfig,
+    key: PRNGKeyArray,
+    *,
+    modes: tuple[Mode, ...],
+    heights: tuple[float, ...],
 ) -> Prediction:
     """Numbers of a config's model in every contact mode; for all but the linear EDMD model.
 
@@ -89,38 +95,44 @@ def build_prediction(
       body: parameters of the rigid body in every mode, stacked.
       config: of the model.
       key: random key of the training data.
-      height: of the centre of mass, for what is linearised beforehand [m].
+      modes: contact modes that ``body`` is stacked over.
+      heights: of the centre of mass in each, for what is linearised beforehand [m].
 
     Raises:
       ConfigError: for a file that cannot be used.
       ValueError: for a fit that is not finite.
     """
-    alpha = jnp.asarray(MODE_ALPHA, float)
+    chosen = np.array(modes)
+    alpha = jnp.asarray(MODE_ALPHA[chosen], float)
     force = jax.vmap(families.hover)(body, alpha)
-    spread = jnp.zeros((len(Mode), 6))
+    spread = jnp.zeros((len(modes), STATE_DIM))
     numbers: Any
     if config.model == "srb_hover":
         numbers = jax.vmap(
-            lambda body, alpha: families.linearised_srb(body, alpha, height, config.dataset.dt)
-        )(body, alpha)
+            lambda body, alpha, height: families.linearised_srb(
+                body, alpha, height, config.dataset.dt
+            )
+        )(body, alpha, jnp.asarray(heights, float))
     elif config.model in ("srb", "planted", "exact"):
         numbers = BodyModel(body, alpha)
     elif config.model == "bilinear":
-        numbers, spread, finite = _fit_bilinear(body, config, key)
+        numbers, spread, finite = _fit_bilinear(body, config, key, modes)
         if not bool(finite):
             raise ValueError("the bilinear fit is not finite: check srb and koopman.dataset ranges")
     elif config.model in ("residual", "learned"):
         stored = _stored(config)
-        own = jax.tree.map(jnp.asarray, stored.numbers)
+        own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[chosen], stored.numbers)
         numbers = ResidualModel(BodyModel(body, alpha), own) if config.model == "residual" else own
-        spread = jnp.asarray(stored.spread)
+        spread = jnp.asarray(stored.spread)[chosen]
     else:
         raise ValueError(f"model '{config.model}' has its own tables (edmd.fit_modes)")
     return Prediction(numbers=numbers, force=force, spread=spread)
 
 
-@partial(jax.jit, static_argnames="config")
-def _fit_bilinear(body: srb.SrbParams, config: KoopmanConfig, key: Array) -> tuple[Any, Any, Any]:
+@partial(jax.jit, static_argnames=("config", "modes"))
+def _fit_bilinear(
+    body: srb.SrbParams, config: KoopmanConfig, key: Array, modes: tuple[Mode, ...]
+) -> tuple[Any, Any, Any]:
     dictionary, data = build_dictionary(config), config.dataset
     measured = config.feet == "measured"
     require_dataset(data, dictionary.size * (1 + INPUT_DIM) + (8 if measured else 0))
@@ -133,8 +145,9 @@ def _fit_bilinear(body: srb.SrbParams, config: KoopmanConfig, key: Array) -> tup
         )  # fmt: skip
         return fit_bilinear(dictionary, snapshots, feet_terms=measured)
 
-    keys = jax.random.split(key, len(Mode))
-    model, report = jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA, float), body)
+    chosen = np.array(modes)
+    keys = jax.random.split(key, len(Mode))[chosen]
+    model, report = jax.vmap(one)(keys, jnp.asarray(MODE_ALPHA[chosen], float), body)
     return model, report.residual_rms, report.finite.all()
 
 

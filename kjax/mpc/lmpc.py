@@ -19,7 +19,7 @@ from kjax.spec import ControllerSpec
 
 
 class LmpcTables(NamedTuple):
-    """Condensed problems, stacked over ``types.Mode`` (M modes, nu = n_u k variables).
+    """Condensed problems, one for each contact mode of each gait (M problems, nu = n_u k).
 
     Attributes:
       hessian: prepared Hessians, for the model's nominal contact points.
@@ -53,17 +53,17 @@ class LmpcMemory(NamedTuple):
 
     Attributes:
       plan: (n_u k,) last force plan, body frame [N].
-      mode: contact mode that it was made in; -1 before the first.
-      warm: where the QP of that mode may go on from; ``None`` where nothing is carried.
+      problem: that it solves; -1 before the first.
+      warm: where the QP of that problem may go on from; ``None`` where nothing is carried.
     """
 
     plan: Float[Array, "nu"]
-    mode: Int[Array, ""]
+    problem: Int[Array, ""]
     warm: qp.Warm | None
 
 
 class ModeSettings(NamedTuple):
-    """Weights and bounds of every contact mode (M modes).
+    """Weights and bounds of every problem (M of them).
 
     Attributes:
       state_weights: (M, n_x) diagonal of Q.
@@ -159,13 +159,13 @@ def start_memory(tables: LmpcTables, spec: ControllerSpec) -> LmpcMemory:
     if hessian_stays and spec.warm_start and spec.solver == "tableau":
         warm = qp.start(jax.tree.map(lambda a: a[0], tables.hessian))
     return LmpcMemory(
-        plan=jnp.zeros_like(tables.lower[0]), mode=jnp.full((), -1, jnp.int32), warm=warm
+        plan=jnp.zeros_like(tables.lower[0]), problem=jnp.full((), -1, jnp.int32), warm=warm
     )
 
 
 def solve_lmpc(
     tables: LmpcTables,
-    mode: Int[Array, ""],
+    problem: Int[Array, ""],
     z: Float[Array, "N"],
     reference: Float[Array, "k n_x"],
     memory: LmpcMemory,
@@ -176,8 +176,8 @@ def solve_lmpc(
     """Force plan of one tick.
 
     Args:
-      tables: of all modes.
-      mode: contact mode, an index; traced.
+      tables: of all problems.
+      problem: index; traced.
       z: lifted state, of the tables' models or of ``model``.
       reference: (k, n_x) states wanted.
       memory: of the last tick.
@@ -185,26 +185,26 @@ def solve_lmpc(
       model: over one model_dt and for the contact points as they are, in place of the tables' own.
       rows: on the forces of every step, besides the box.
     """
-    lower, upper = tables.lower[mode], tables.upper[mode]
+    lower, upper = tables.lower[problem], tables.upper[problem]
     if model is None:
-        hessian, index, F, G = tables.hessian, mode, tables.F[mode], tables.G[mode]
+        hessian, index, F, G = tables.hessian, problem, tables.F[problem], tables.G[problem]
     else:
-        Q, R = tables.state_weights[mode], tables.input_weights[mode]
+        Q, R = tables.state_weights[problem], tables.input_weights[problem]
         if spec.discounts_uncertainty:
             Q = cautious_weights(
-                model.A, Q, tables.spread[mode], tables.uncertainty_discount, spec.horizon
+                model.A, Q, tables.spread[problem], tables.uncertainty_discount, spec.horizon
             )
-        problem = condense(model.A, model.B, Q, R, spec.horizon)
-        hessian, index = qp.prepare(problem.H, lower == upper), None
-        F, G = problem.F, problem.G
-    q = F @ z - G @ reference.reshape(-1) + tables.q_input[mode]
+        condensed = condense(model.A, model.B, Q, R, spec.horizon)
+        hessian, index = qp.prepare(condensed.H, lower == upper), None
+        F, G = condensed.F, condensed.G
+    q = F @ z - G @ reference.reshape(-1) + tables.q_input[problem]
 
     warm: qp.Warm | Array | None = memory.warm
     if memory.warm is not None:
-        # Another mode is another Hessian: its own cold start then.
-        cold = (tables.hessian.table[mode], tables.hessian.side[mode])
+        # Another problem is another Hessian: its own cold start then.
+        cold = (tables.hessian.table[problem], tables.hessian.side[problem])
         table, side = jax.tree.map(
-            lambda old, new: jnp.where(mode == memory.mode, old, new),
+            lambda old, new: jnp.where(problem == memory.problem, old, new),
             (memory.warm.table, memory.warm.side),
             cold,
         )

@@ -28,35 +28,49 @@ from kjax.types import GRAVITY, MODE_ALPHA, RobotParams
 class MultiPhaseParams(NamedTuple):
     """Numbers of the multi-phase LMPC; weights are per second of the horizon.
 
+    Those with an axis (G,) are by gait in the controller's parameters; ``for_gait`` picks.
+
     Attributes:
       nodes: (G, P) number of nodes of a whole phase.
-      state_weights: (6,) diagonal of Q [1/s and the state's units].
-      input_weight: R of every force [1/(N^2 s)].
+      state_weights: (G, 6) diagonal of Q [1/s and the state's units].
+      input_weight: (G,) R of every force [1/(N^2 s)].
       mass: [kg].
       inertia: [kg m^2].
       friction: mu of the pyramid [-].
       torque_limit: (2,) of thigh and calf [N m].
-      force_x_max: bound of |F_x| per leg [N].
-      force_z: (2,) bounds of F_z per leg [N].
-      feet: (2,) place of the front and rear feet ahead of the centre of mass, standing still [m].
-      velocity_gain: of the footholds on the velocity error [s].
+      force_x_max: (G,) bound of |F_x| per leg [N].
+      force_z: (G, 2) bounds of F_z per leg [N].
+      feet: (G, 2) place of the front and rear feet ahead of the centre of mass, standing still [m].
+      velocity_gain: (G,) of the footholds on the velocity error [s].
       velocity_time: time in which the velocity is predicted to reach its reference [s].
       height_time: the same of height and pitch [s].
     """
 
     nodes: Int[Array, "G P"]
-    state_weights: Float[Array, "6"]
-    input_weight: Float[Array, ""]
+    state_weights: Float[Array, "*gait 6"]
+    input_weight: Float[Array, "*gait"]
     mass: Float[Array, ""]
     inertia: Float[Array, ""]
     friction: Float[Array, ""]
     torque_limit: Float[Array, "2"]
-    force_x_max: Float[Array, ""]
-    force_z: Float[Array, "2"]
-    feet: Float[Array, "2"]
-    velocity_gain: Float[Array, ""]
+    force_x_max: Float[Array, "*gait"]
+    force_z: Float[Array, "*gait 2"]
+    feet: Float[Array, "*gait 2"]
+    velocity_gain: Float[Array, "*gait"]
     velocity_time: Float[Array, ""]
     height_time: Float[Array, ""]
+
+
+def for_gait(params: MultiPhaseParams, gait: Int[Array, ""]) -> MultiPhaseParams:
+    """Numbers with those that depend on the gait picked for ``gait``, but for ``nodes``."""
+    return params._replace(
+        state_weights=params.state_weights[gait],
+        input_weight=params.input_weight[gait],
+        force_x_max=params.force_x_max[gait],
+        force_z=params.force_z[gait],
+        feet=params.feet[gait],
+        velocity_gain=params.velocity_gain[gait],
+    )
 
 
 class Nodes(NamedTuple):

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from kjax.config import Overlay, RunConfig, Tunable, load_config, to_dict, tunable
+from kjax.config import Gaits, Overlay, RunConfig, Tunable, load_config, to_dict, tunable
 from kjax.koopman.families import BodyModel
 from kjax.params import ControllerParams, Fits, cast
 from kjax.resolve import fit_models, gather
-from kjax.rigid_body import own_body
+from kjax.rigid_body import body_numbers
 from kjax.robots import go1
 from kjax.types import RobotParams
 
@@ -56,7 +56,7 @@ def build_space(
     """Variables for some keys of a config.
 
     The Koopman models are fitted once, here: where a key moves the nominal contact points
-    (bound.feet_*, bound.height), models with fixed feet stay those of the config.
+    (gaits.NAME.feet_*, height), models with fixed feet stay those of the config.
 
     Args:
       config: that all other numbers come from.
@@ -67,17 +67,19 @@ def build_space(
     Raises:
       ValueError: for a key that is no variable, or one whose number has no logarithm.
     """
+    kinds = tunable(RunConfig, config.gaits)
     if not keys:
         raise ValueError("keys must name at least one variable, got none")
     for key in keys:
-        if key not in TUNABLE:
-            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(TUNABLE)}")
+        if key not in kinds:
+            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
         if key.startswith("srb.") and config.koopman.model not in ("srb", "planted", "exact"):
             raise ValueError(
                 f"keys: '{key}' is a variable of koopman.model 'srb', 'planted' and 'exact' only, "
                 f"whose model it is; got '{config.koopman.model}', which is fitted to data"
             )
-    config = replace(config, srb=own_body(config.srb, robot, config.lmpc.height))
+    mass, inertia = (float(number) for number in body_numbers(config, robot))
+    config = replace(config, srb=replace(config.srb, mass=mass, inertia=inertia))
     if fits is None:
         with jax.enable_x64(True):
             fits = fit_models(config, robot)
@@ -85,13 +87,13 @@ def build_space(
 
     def values(variables: Variables) -> dict[str, Array]:
         return {
-            key: jnp.exp(one) if (unit := TUNABLE[key].unit) is None else one * unit
+            key: jnp.exp(one) if (unit := kinds[key].unit) is None else one * unit
             for key, one in variables.items()
         }
 
     def inside(variables: Variables) -> Variables:
         return {
-            key: jnp.clip(one, *(_forward(TUNABLE[key], edge) for edge in _range(TUNABLE[key])))
+            key: jnp.clip(one, *(_forward(kinds[key], edge) for edge in _range(kinds[key])))
             for key, one in variables.items()
         }
 
@@ -116,24 +118,30 @@ def build_space(
 
     start = {}
     for key in keys:
-        section, name = key.split(".")
-        number = np.asarray(getattr(getattr(config, section), name), float)
-        if TUNABLE[key].unit is None and not (number > 0).all():
+        held: Any = config
+        for part in key.split("."):
+            held = held[part] if isinstance(held, Gaits) else getattr(held, part)
+        if held is None:
+            raise ValueError(f"{key} is not given by the config: it has no value to start from")
+        number = np.asarray(held, float)
+        if kinds[key].unit is None and not (number > 0).all():
             raise ValueError(f"{key} must be positive to be tuned, got {number.tolist()}")
-        start[key] = jnp.asarray(_forward(TUNABLE[key], number), dtype)
+        start[key] = jnp.asarray(_forward(kinds[key], number), dtype)
     return Space(start, values, inside, params, overrides)
 
 
 def tuned_config(config: RunConfig, overrides: Mapping[str, Any]) -> RunConfig:
     """The config with other values at some keys, checked as any other."""
-    data = to_dict(config)
-    flat = {
-        f"{section}.{name}": value
-        for section, entries in data.items()
-        if isinstance(entries, dict)
-        for name, value in entries.items()
-    } | {key: value for key, value in data.items() if not isinstance(value, dict)}
-    return load_config(RunConfig, None, {**flat, **overrides})
+    return load_config(RunConfig, None, {**_flat(to_dict(config)), **overrides})
+
+
+def _flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted key."""
+    flat: dict[str, Any] = {}
+    for name, value in data.items():
+        inside = _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else None
+        flat |= {f"{prefix}{name}": value} if inside is None else inside
+    return flat
 
 
 def _forward(kind: Tunable, number: Any) -> Any:
@@ -143,3 +151,11 @@ def _forward(kind: Tunable, number: Any) -> Any:
 
 def _range(kind: Tunable) -> tuple[float, float]:
     return kind.low, kind.high
+
+
+def shown(kinds: Mapping[str, Tunable]) -> list[str]:
+    """Keys, those of the gaits once."""
+    parts = (key.split(".") for key in kinds)
+    return list(
+        dict.fromkeys(f"gaits.NAME.{p[2]}" if p[0] == "gaits" else ".".join(p) for p in parts)
+    )

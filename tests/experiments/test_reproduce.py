@@ -8,7 +8,7 @@ from argparse import Namespace
 
 import pytest
 
-from kjax.gait import bound
+from kjax.gait import Gait, phases
 from kjax.sim.resolve import batch_spec
 
 
@@ -46,7 +46,8 @@ def test_request_times_cover_a_cycle_of_the_gait_that_is_left(experiments):
 
 
 def test_the_naive_switch_is_asked_for_in_the_middle_of_a_stance(experiments):
-    gait = bound(0.1, 0.1, 0.05, 0.1, ramp_start=0.5, ramp_cycles=2)
+    cycle = phases(0.35, (0.0, 0.0, 4 / 7, 4 / 7), (2 / 7, 2 / 7, 1 / 7, 1 / 7))
+    gait = Gait("bound", cycle, ramp_start=0.5, ramp_cycles=2)
     # By hand: cycles of 0.25, 0.30 and then 0.35 s begin at 0, 0.25, 0.55, 0.90, ...
     times = experiments.paper_results.mid_stances(gait, 1.0, 1.58, 4)
     rear, front = 1.55 + 0.2, 1.90

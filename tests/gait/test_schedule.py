@@ -19,16 +19,33 @@ ALL = (True, True, True, True)
 BOUND = Gait(
     "by hand",
     (
-        Phase(FRONT, Mode.FRONT, 0.10),
-        Phase(NONE, Mode.FLIGHT, 0.04),
-        Phase(REAR, Mode.REAR, 0.12),
-        Phase(NONE, Mode.FLIGHT, 0.06),
+        Phase(FRONT, 0.10),
+        Phase(NONE, 0.04),
+        Phase(REAR, 0.12),
+        Phase(NONE, 0.06),
     ),
 )
 
 
 def one(name, *phases, **rules):
     return Gait(name, phases, **rules)
+
+
+def trot(stance_time, flight_time=0.0):
+    period = 2.0 * (stance_time + flight_time)
+    duty = stance_time / period
+    return one("trot", *gait.phases(period, (0.0, 0.5, 0.5, 0.0), (duty,) * 4))
+
+
+def stand(duration=1.0, **rules):
+    return one(rules.pop("name", "stand"), *gait.phases(duration, (0.0,) * 4, (1.0,) * 4), **rules)
+
+
+def bounding(stances, flights, **rules):
+    return one(
+        "bound", Phase(FRONT, stances[0]), Phase(NONE, flights[0]),
+        Phase(REAR, stances[1]), Phase(NONE, flights[1]), **rules,
+    )  # fmt: skip
 
 
 def cast(tree, dtype):
@@ -70,7 +87,7 @@ def test_the_first_tick_enters_the_first_phase_at_its_beginning():
 
 
 def test_trot_alternates_the_diagonals():
-    schedule = gait.build_schedule([gait.trot(0.25)])
+    schedule = gait.build_schedule([trot(0.25)])
     phase, _ = record(schedule, dt=0.005, ticks=200)
     stance = np.asarray(schedule.stance[0])[phase]
     first = stance[:50]
@@ -83,7 +100,7 @@ def test_trot_alternates_the_diagonals():
 
 
 def test_a_flying_trot_leaves_the_ground_after_each_diagonal():
-    schedule = gait.build_schedule([gait.trot(0.20, 0.05)])
+    schedule = gait.build_schedule([trot(0.20, 0.05)])
     phase, _ = record(schedule, dt=0.005, ticks=200)
     stance, mode = np.asarray(schedule.stance[0])[phase], np.asarray(schedule.mode[0])[phase]
     diagonal = np.array([True, False, False, True])
@@ -95,7 +112,7 @@ def test_a_flying_trot_leaves_the_ground_after_each_diagonal():
 @pytest.mark.parametrize("stance_time", [0.25, 0.2513, 0.0171, 0.005])
 def test_the_mean_period_is_exact_whatever_the_tick(dtype, stance_time):
     dt, ticks = 0.005, 20_000
-    schedule = gait.build_schedule([gait.trot(stance_time)])
+    schedule = gait.build_schedule([trot(stance_time)])
     phase, elapsed = record(schedule, dt=dt, ticks=ticks, dtype=dtype)
     switch = entries(phase) * dt
     ideal = np.arange(len(switch)) * np.asarray(stance_time, dtype).astype(float)
@@ -121,14 +138,14 @@ def timeline(phases, leg):
 
 
 GAITS = {
-    "trot": gait.trot(0.2),
-    "flying trot": gait.trot(0.2, 0.03),
+    "trot": trot(0.2),
+    "flying trot": trot(0.2, 0.03),
     "bound": BOUND,
     "stance over the end of the cycle": one(
         "odd",
-        Phase(FRONT, Mode.FRONT, 0.10),
-        Phase(REAR, Mode.REAR, 0.12),
-        Phase(ALL, Mode.STAND, 0.05),
+        Phase(FRONT, 0.10),
+        Phase(REAR, 0.12),
+        Phase(ALL, 0.05),
     ),
 }
 
@@ -176,13 +193,13 @@ def test_a_bound_waits_out_flight_and_the_other_pair():
 
 
 def test_a_leg_that_always_stands_stands_for_the_whole_cycle():
-    schedule = gait.build_schedule([gait.stand()])
+    schedule = gait.build_schedule([stand()])
     np.testing.assert_array_equal(schedule.stance_time, 1.0)
     np.testing.assert_array_equal(schedule.time_to_touchdown, 0.0)
 
 
 def test_every_time_in_a_schedule_is_a_floating_number():
-    for phases in (gait.stand(), gait.trot(0.25)):
+    for phases in (stand(), trot(0.25)):
         schedule = gait.build_schedule([phases])
         for times in (
             schedule.duration,
@@ -195,14 +212,14 @@ def test_every_time_in_a_schedule_is_a_floating_number():
 
 
 def test_a_shorter_gait_never_enters_its_padding():
-    schedule = gait.build_schedule([gait.trot(0.02), BOUND])
+    schedule = gait.build_schedule([trot(0.02), BOUND])
     chex.assert_shape(schedule.stance, (2, 4, 4))
-    trot, _ = record(schedule, dt=0.005, ticks=100, index=0)
+    short, _ = record(schedule, dt=0.005, ticks=100, index=0)
     bound, _ = record(schedule, dt=0.005, ticks=200, index=1)
-    assert set(trot) == {0, 1}
+    assert set(short) == {0, 1}
     assert set(bound) == {0, 1, 2, 3}
-    alone, _ = record(gait.build_schedule([gait.trot(0.02)]), dt=0.005, ticks=100)
-    np.testing.assert_array_equal(trot, alone)
+    alone, _ = record(gait.build_schedule([trot(0.02)]), dt=0.005, ticks=100)
+    np.testing.assert_array_equal(short, alone)
 
 
 def test_phases_come_in_order():
@@ -218,7 +235,7 @@ def test_the_clock_moves_on_by_one_phase_at_most():
 
 
 def test_gaits_in_a_batch_are_an_index_and_trace_once(dtype):
-    schedule = gait.build_schedule([gait.trot(0.02), gait.stand(), BOUND])
+    schedule = gait.build_schedule([trot(0.02), stand(), BOUND])
     schedule = jax.tree.map(jnp.asarray, cast(schedule, dtype))
 
     @jax.jit
@@ -239,7 +256,7 @@ RAMP_START, RAMP_CYCLES, STANCES, FLIGHTS = 0.3, 10, (0.1017, 0.0508), (0.1003, 
 
 def ramped(**changes):
     settings = {"ramp_start": RAMP_START, "ramp_cycles": RAMP_CYCLES} | changes
-    return gait.bound(STANCES[0], FLIGHTS[0], STANCES[1], FLIGHTS[1], **settings)
+    return bounding(STANCES, FLIGHTS, switch_rule="first_flight", **settings)
 
 
 def unrolled(cycles, *, start=RAMP_START, grown_after=RAMP_CYCLES):
@@ -263,7 +280,7 @@ def ramp():
     """Clocks of 15 cycles of a ramped bound at 200 Hz, and their times to touchdown."""
     dt = 0.005
     begins = unrolled(15)
-    schedule = gait.build_schedule([gait.trot(0.25), ramped()])
+    schedule = gait.build_schedule([trot(0.25), ramped()])
     clocks = walk(schedule, begin(1, dt), dt, int(begins[-1] / dt))
     waits = jax.jit(jax.vmap(partial(gait.time_to_touchdown, schedule)))(clocks)
     lengths = jax.jit(jax.vmap(partial(gait.phase_duration, schedule)))(clocks)
@@ -345,15 +362,14 @@ TROT, BOUNDING, LANDING = 0, 1, 2
 def gaits(*, anywhere=False, landing=False, tick=TICK):
     return gait.build_schedule(
         [
-            gait.trot(STANCE_TICKS * tick),
-            gait.bound(
-                *(TICKS * tick),
-                ramp_start=1.0,
-                ramp_cycles=0,
-                leave_anywhere=anywhere,
+            trot(STANCE_TICKS * tick),
+            bounding(
+                TICKS[::2] * tick,
+                TICKS[1::2] * tick,
+                switch_rule="anywhere" if anywhere else "first_flight",
                 leave_through="landing" if landing else "",
             ),
-            gait.stand(LANDING_TICKS * tick, name="landing"),
+            stand(LANDING_TICKS * tick, name="landing", switch_rule="cycle_end"),
         ]
     )
 
@@ -482,7 +498,7 @@ def test_a_request_withdrawn_before_it_may_be_met_changes_nothing():
 def test_a_switch_does_not_wait_for_the_remainder_of_a_phase(dtype):
     """A phase of 10.6 ticks ends at the 11th, one of 10.4 at the 10th: both may be left then."""
     dt = 0.005
-    schedule = cast(gait.build_schedule([gait.trot(10.6 * dt), BOUND]), dtype)
+    schedule = cast(gait.build_schedule([trot(10.6 * dt), BOUND]), dtype)
     clocks = follow(schedule, begin(0, dt, dtype), requests(0, 1, ASKED, LENGTH), dt)
     np.testing.assert_array_equal(switched(clocks, 1), ASKED)
 
@@ -513,17 +529,66 @@ def test_switches_of_any_kind_trace_once_and_keep_the_clock_s_types(dtype):
     ("gaits", "message"),
     [
         ([], "gaits must be"),
-        ([gait.stand(), one("empty")], "gaits must be"),
-        ([one("x", Phase(FRONT, Mode.FRONT, 0.0))], r"durations must be positive, got 0"),
-        ([one("x", Phase(FRONT, Mode.FRONT, -0.1))], r"durations must be positive, got -0.1"),
-        ([one("x", Phase(FRONT, Mode.FRONT, np.nan))], r"durations must be positive, got nan"),
-        ([one("x", Phase(FRONT, Mode.FRONT, 0.1))], "leg 2 never stands"),
-        ([gait.bound(0.1, 0.0, 0.1, 0.1, ramp_start=1.0, ramp_cycles=0)], "must be positive"),
-        ([gait.trot(0.0, 0.1)], "leg 0 never stands"),
-        ([gait.stand(0.0)], r"durations must be positive, got 0"),
-        ([gait.stand(), one("x", *BOUND.phases, leave_through="nowhere")], "'nowhere'"),
+        ([stand(), one("empty")], "gaits must be"),
+        ([one("x", Phase(FRONT, 0.0))], r"durations must be positive, got 0"),
+        ([one("x", Phase(FRONT, -0.1))], r"durations must be positive, got -0.1"),
+        ([one("x", Phase(FRONT, np.nan))], r"durations must be positive, got nan"),
+        ([one("x", Phase(FRONT, 0.1))], "leg 2 never stands"),
+        ([bounding((0.1, 0.1), (0.0, 0.1))], "must be positive"),
+        ([one("x", Phase(NONE, 0.1))], "leg 0 never stands"),
+        ([stand(0.0)], r"durations must be positive, got 0"),
+        ([stand(switch_rule="first_flight")], "stand has no flight"),
+        ([stand(), one("x", *BOUND.phases, leave_through="nowhere")], "'nowhere'"),
     ],
 )
 def test_a_gait_that_cannot_be_walked_is_refused(gaits, message):
     with pytest.raises(ValueError, match=message):
         gait.build_schedule(gaits)
+
+
+OFFSETS = {  # touchdown and duty factor of FR, FL, RR, RL -> phases: legs that stand, in sixtieths
+    "trot": ((0, 0.5, 0.5, 0), (0.5,) * 4, [("FR RL", 30), ("FL RR", 30)]),
+    "flying trot": (
+        (0, 0.5, 0.5, 0), (5 / 12,) * 4, [("FR RL", 25), ("", 5), ("FL RR", 25), ("", 5)],
+    ),
+    "pace": ((0, 0.5, 0, 0.5), (0.5,) * 4, [("FR RR", 30), ("FL RL", 30)]),
+    "pronk": ((0,) * 4, (0.6,) * 4, [("FR FL RR RL", 36), ("", 24)]),
+    "walk": (
+        (0.5, 0, 0.25, 0.75), (0.75,) * 4,
+        [("FR FL RL", 15), ("FL RR RL", 15), ("FR FL RR", 15), ("FR RR RL", 15)],
+    ),
+    "bound": (
+        (0, 0, 4 / 7, 4 / 7), (2 / 7, 2 / 7, 1 / 7, 1 / 7),
+        [("FR FL", 120 / 7), ("", 120 / 7), ("RR RL", 60 / 7), ("", 120 / 7)],
+    ),
+    "stand": ((0.3,) * 4, (1.0,) * 4, [("FR FL RR RL", 60)]),
+    "none at the beginning": (
+        (0.1, 0.1, 0.6, 0.6), (0.5,) * 4, [("FR FL", 30), ("RR RL", 30)],
+    ),
+    "over the end of the cycle": (
+        (0.8, 0.8, 0.3, 0.3), (0.4, 0.4, 0.5, 0.5), [("", 6), ("RR RL", 30), ("FR FL", 24)],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OFFSETS)
+def test_offsets_and_duty_factors_give_the_phases(name):
+    offset, duty, wanted = OFFSETS[name]
+    found = gait.phases(0.6, tuple(map(float, offset)), tuple(map(float, duty)))
+    legs = [" ".join(Leg(i).name for i in range(4) if phase.stance[i]) for phase in found]
+    assert legs == [text for text, _ in wanted]
+    durations = [phase.duration for phase in found]
+    np.testing.assert_allclose(durations, [0.01 * part for _, part in wanted], rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_legs_of_any_gait_stand_from_their_touchdown_for_their_duty_factor(seed):
+    rng = np.random.default_rng(seed)
+    offset, duty = rng.uniform(0, 1, 4), rng.uniform(0.1, 0.95, 4)
+    found = gait.phases(1.0, offset.tolist(), duty.tolist())
+    begin = min(list(offset) + list((offset + duty) % 1.0))
+    ends = begin + np.cumsum([phase.duration for phase in found])
+    assert ends[-1] == pytest.approx(begin + 1.0, abs=1e-12)
+    for at in begin + (np.arange(500) + 0.5) / 500:
+        phase = found[int(np.searchsorted(ends, at))]
+        assert phase.stance == tuple((at - offset) % 1.0 < duty)

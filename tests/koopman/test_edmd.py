@@ -233,10 +233,9 @@ def test_every_figure_of_the_report_is_a_number_even_for_data_of_zeros(fit_modes
 def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contact_points():
     config = KoopmanConfig(order=1, dataset=DatasetConfig(rollouts=10, duration=0.01))
     bounding = ((0.07, -0.24), (-0.15, -0.25))
-    body = edmd.srb_params(
-        SrbConfig(mass=10.0, inertia=0.3, feet_front=(0.2, -0.3), feet_rear=(-0.1, -0.3)),
-        {Mode.FRONT: bounding, Mode.REAR: bounding},
-    )
+    own = ((0.2, -0.3), (-0.1, -0.3))
+    feet = [bounding if mode in (Mode.FRONT, Mode.REAR) else own for mode in Mode]
+    body = edmd.stack_bodies(10.0, 0.3, feet)
     model, report = jax.jit(edmd.fit_modes, static_argnames="config")(
         body, config, jax.random.key(0)
     )
@@ -250,17 +249,27 @@ def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contac
         np.testing.assert_allclose(model.B[mode, 6], DT * alpha * arms / 0.3, rtol=0, atol=1e-15)
 
 
-def test_bodies_of_all_modes_differ_in_their_contact_points_only():
+def test_bodies_are_stacked_with_a_leading_axis():
     config = SrbConfig(mass=10.0, inertia=0.3, feet_front=(0.2, -0.3), feet_rear=(-0.1, -0.3))
-    other = ((0.05, -0.2), (-0.06, -0.25))
-    body = edmd.srb_params(config, {Mode.REAR: other})
+    body = edmd.srb_params(config)
     np.testing.assert_array_equal(body.mass, np.full(len(Mode), 10.0))
     np.testing.assert_array_equal(body.inertia, np.full(len(Mode), 0.3))
-    for mode in Mode:
-        expected = other if mode == Mode.REAR else ((0.2, -0.3), (-0.1, -0.3))
-        np.testing.assert_array_equal(body.feet[mode], expected)
-    for leaf in edmd.srb_params(config):
-        np.testing.assert_array_equal(leaf, np.broadcast_to(leaf[:1], leaf.shape))
+    np.testing.assert_array_equal(body.feet, [((0.2, -0.3), (-0.1, -0.3))] * len(Mode))
+
+
+def test_a_mode_is_fitted_to_the_same_data_in_any_list_of_modes():
+    config = KoopmanConfig(dataset=DatasetConfig(rollouts=40))
+    body = edmd.srb_params(
+        SrbConfig(mass=10.0, inertia=0.3, feet_front=(0.2, -0.3), feet_rear=(-0.1, -0.3))
+    )
+    fit = jax.jit(edmd.fit_modes, static_argnames=("config", "modes"))
+    key = jax.random.key(0)
+    whole, _ = fit(body, config, key)
+    chosen = (Mode.STAND, Mode.TROT)
+    some, _ = fit(jax.tree.map(lambda a: a[:2], body), config, key, modes=chosen)
+    for place, mode in enumerate(chosen):
+        # Vectorised over another number of modes: rounding.
+        np.testing.assert_allclose(some.B[place], whole.B[mode], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def data(episodes):
 def test_a_known_residual_is_recovered_to_rounding(data, body, weights):
     fit = whole_body.fit(data, body, dt=DT)
     assert fit.rank[Mode.TROT] == fit.columns[Mode.TROT] == 17
-    assert fit.rows.tolist() == [0, 0, 0, 10 * (4 * PHASE - 3), 0]
+    assert fit.rows.tolist() == [0, 0, 0, 10 * (4 * PHASE - 3), *[0] * 5]
     # states of order 10 in float64 over a condition of 1e3 or so
     np.testing.assert_allclose(fit.W, weights, atol=1e-10)
     assert fit.after[Mode.TROT].max() < 1e-13 < fit.before[Mode.TROT, 3:].min()
@@ -284,10 +284,6 @@ def test_what_cannot_be_used_is_said(body, weights):
     still = one._replace(stance=np.ones_like(one.stance))
     with pytest.raises(ValueError, match="at least one whole phase"):
         transitions([still], dt=DT, sole=SOLE)
-    odd = np.array(one.stance)
-    odd[3] = [True, False, False, False]
-    with pytest.raises(ValueError, match=r"no contact mode has the legs \[0\]"):
-        transitions([one._replace(stance=odd)], dt=DT, sole=SOLE)
 
 
 @pytest.mark.slow

@@ -10,16 +10,18 @@ import numpy as np
 import pytest
 
 from kjax import planning, srb
-from kjax.config import BoundConfig, LmpcConfig
+from kjax.config import GaitConfig, Gaits, LmpcConfig, RunConfig
+from kjax.config.gaits import LIBRARY
 from kjax.koopman import models, observables
 from kjax.legs.kinematics import LegTrig, leg_trig
 from kjax.mpc import lmpc
 from kjax.mpc.limits import force_limits
 from kjax.qp import Status
-from kjax.resolve import mode_settings
+from kjax.resolve import problem_settings
 from kjax.robots import go1
 from kjax.spec import ControllerSpec
 from kjax.types import MODE_ALPHA, Mode
+from kjax.walkable import Problem
 
 DT = 1e-3  # s, step of the fitted models
 MASS = 12.7
@@ -32,12 +34,14 @@ FREE = LmpcConfig(
     force_z_max=np.inf,
     tolerance=1e-11,
 )
-FREE_BOUND = BoundConfig(force_x_max=np.inf, force_z_min=-np.inf, force_z_max=np.inf)
+FREE_BOUND = dataclasses.replace(
+    LIBRARY["bound"], force_x_max=np.inf, force_z_min=-np.inf, force_z_max=np.inf
+)
 BOUNDED = LmpcConfig(
     horizon=4, model_dt=0.005, force_z_min=5.0, tolerance=1e-9, input_reference="zero"
 )
 # A bound's own weights and bounds, all unlike those of the other modes.
-BOUND = BoundConfig(
+BOUND = GaitConfig(
     state_weights=(900.0, 1e4, 500.0, 5.0, 2.0, 0.2),
     input_weight=3e-5,
     force_x_max=40.0,
@@ -58,6 +62,14 @@ def here(tables, mode, feet):
     """The tables' model of a mode for contact points that are measured."""
     model = jax.tree.map(lambda a: a[mode], tables.model)
     return model._replace(B=models.input_map(model, feet))
+
+
+def mode_settings(lmpc, bound, force):
+    """Front and rear stance those of a bound, the other modes of gaits without their own."""
+    names = ["bound" if mode in (Mode.FRONT, Mode.REAR) else "trot" for mode in Mode]
+    config = RunConfig(lmpc=lmpc, gaits=Gaits({"bound": bound, "trot": GaitConfig()}))
+    problems = [Problem(gait=int(mode), mode=mode) for mode in Mode]
+    return problem_settings(config, problems, names, force)
 
 
 def build(model, feet, config, bound):
@@ -111,7 +123,7 @@ def start():
 
 def memory(dtype="float64"):
     """Nothing remembered."""
-    return lmpc.LmpcMemory(plan=jnp.zeros(16, dtype), mode=jnp.asarray(-1, jnp.int32), warm=None)
+    return lmpc.LmpcMemory(plan=jnp.zeros(16, dtype), problem=jnp.asarray(-1, jnp.int32), warm=None)
 
 
 def horizon_by_hand(model, mode, config, x):
@@ -239,8 +251,8 @@ def test_plans_of_a_batch_with_mixed_modes_equal_single_plans(bounded, start):
             in_axes=(0, 0),
         )
     )
-    states = jnp.stack([x + 0.01 * i for i in range(5)])
-    plans = batch(jnp.arange(5), jax.vmap(lift)(states))
+    states = jnp.stack([x + 0.01 * i for i in range(len(Mode))])
+    plans = batch(jnp.arange(len(Mode)), jax.vmap(lift)(states))
     for mode in Mode:
         single = solve(
             bounded, jnp.asarray(int(mode)), lift(states[mode]), reference, memory(), SPEC
@@ -271,7 +283,7 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
         plan = lmpc.solve_lmpc(bounded, mode, lift(x), reference, memory, SPEC)
         for _ in range(5):
             x = srb.rk4_step(body, alpha, x, plan.plan[:4], DT)
-        memory = lmpc.LmpcMemory(plan=plan.plan, mode=mode, warm=plan.warm)
+        memory = lmpc.LmpcMemory(plan=plan.plan, problem=mode, warm=plan.warm)
         return (x, memory), (x, plan.status)
 
     x0 = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
@@ -287,7 +299,7 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
 
 @pytest.mark.parametrize("mode", list(Mode))
 def test_the_mean_force_becomes_the_input_reference_of_standing_legs(mode):
-    force = 10.0 + np.arange(10.0).reshape(len(Mode), 2)
+    force = 10.0 + np.arange(2.0 * len(Mode)).reshape(-1, 2)
     settings = mode_settings(FREE, FREE_BOUND, jnp.asarray(force))
     lower, upper, reference = (
         a[mode].reshape(2, 2) for a in (settings.lower, settings.upper, settings.input_reference)
@@ -388,7 +400,7 @@ def test_a_tableau_carried_across_modes_changes_no_plan(bounded, start):
         cold = solve(bounded, now, lift(seen), reference, memory(), spec=SPEC)
         assert warm.status == Status.SOLVED
         np.testing.assert_allclose(warm.plan, cold.plan, rtol=0, atol=1e-8)
-        carried = lmpc.LmpcMemory(plan=warm.plan, mode=now, warm=warm.warm)
+        carried = lmpc.LmpcMemory(plan=warm.plan, problem=now, warm=warm.warm)
 
 
 def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bounded, start):
@@ -449,7 +461,7 @@ def test_with_rows_the_warm_start_is_carried_and_admm_plans_the_same(bounded, st
     carried = lmpc.start_memory(bounded, SPEC)
     first = solve(bounded, mode, z, reference, carried, spec=SPEC, rows=rows)
     assert first.warm is not None
-    again = lmpc.LmpcMemory(plan=first.plan, mode=mode, warm=first.warm)
+    again = lmpc.LmpcMemory(plan=first.plan, problem=mode, warm=first.warm)
     second = solve(bounded, mode, z, reference, again, spec=SPEC, rows=rows)
     assert second.iterations <= first.iterations  # the box's part of them is 0 now
     box = solve(bounded, mode, z, reference, again, spec=SPEC)

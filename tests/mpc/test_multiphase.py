@@ -8,11 +8,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kjax import gait
-from kjax.config import BoundConfig, MultiPhaseConfig, RunConfig, SimConfig
+from kjax.config import RunConfig, load_config
 from kjax.mpc import multiphase
 from kjax.resolve import multiphase_params
 from kjax.robots import go1
-from kjax.types import GRAVITY, Leg, Mode
+from kjax.types import GRAVITY, Leg
 from kjax.walkable import build_gaits, cycle_nodes
 
 COUNT = 15
@@ -23,29 +23,34 @@ DURATION = (0.1, 0.1, 0.05, 0.1)  # s
 
 @pytest.fixture(scope="module")
 def config():
-    return RunConfig(
-        sim=SimConfig(base="planar"),
-        bound=BoundConfig(
-            horizon="multiphase", feet_front=0.05, feet_rear=0.1, velocity_gain=0.075
-        ),
-        multiphase=MultiPhaseConfig(
-            state_weights=(16.0, 151.0, 13.8, 38.2, 2.67, 0.145),
-            input_weight=1.7e-6,
-            force_x_max=135.0,
-            force_z_min=10.0,
-            force_z_max=250.0,
-            friction=0.6,
-            torque_fraction=0.95,
-            inertia_scale=0.87,
-            velocity_time=0.3,
-            height_time=0.05,
-        ),
-    )
+    keys = {
+        "sim.base": "planar",
+        "gait.also": ["trot", "bound_multiphase"],
+        "multiphase.friction": 0.6,
+        "multiphase.torque_fraction": 0.95,
+        "multiphase.inertia_scale": 0.87,
+        "multiphase.velocity_time": 0.3,
+        "multiphase.height_time": 0.05,
+    }
+    own = {
+        "state_weights": [16.0, 151.0, 13.8, 38.2, 2.67, 0.145],
+        "input_weight": 1.7e-6,
+        "force_x_max": 135.0,
+        "force_z_min": 10.0,
+        "force_z_max": 250.0,
+        "feet_front": 0.05,
+        "feet_rear": 0.1,
+        "velocity_gain": 0.075,
+        "height": 0.27,
+    }
+    keys |= {f"gaits.bound_multiphase.{key}": value for key, value in own.items()}
+    return load_config(RunConfig, None, keys)
 
 
 @pytest.fixture(scope="module")
 def params(config):
-    return multiphase_params(build_gaits(config), config, go1.PARAMS)
+    params = multiphase_params(build_gaits(config), config, go1.PARAMS)
+    return multiphase.for_gait(params, jnp.asarray(BOUND))
 
 
 @pytest.fixture(scope="module")
@@ -279,8 +284,8 @@ def test_only_a_bound_with_that_horizon_has_nodes(config):
     nodes = cycle_nodes(gaits, config)
     assert nodes[BOUND].tolist() == [8, 1, 4, 1]
     assert nodes.sum() == nodes[BOUND].sum()
-    assert cycle_nodes(gaits, RunConfig()).sum() == 0
-    assert [phase.mode for phase in gaits[BOUND].phases][1] == Mode.FLIGHT
+    assert cycle_nodes(build_gaits(RunConfig()), RunConfig()).sum() == 0
+    assert gaits[BOUND].phases[1].flies
 
 
 @pytest.mark.parametrize("slew", [2.0, np.inf])

@@ -23,7 +23,25 @@ VALUES = {
     "srb.feet_front": [0.2, -0.25],
     "srb.feet_rear": [-0.2, -0.25],
     "gait.names": ["bound"],
-    "bound.height": 0.28,
+    "command.height": [0.0, 0.01, 0.0, 0.0, 0.0],
+    "gaits.bound.duty": [0.29, 0.29, 0.15, 0.15],
+    "gait.also": ["trot", "bound", "stand", "walk"],
+    **{
+        f"gaits.{gait}.{key}": value
+        for gait in ("trot", "bound")
+        for key, value in {
+            "leave_through": "stand",
+            "switch_rule": "cycle_end",
+            "height": 0.28,
+            "state_weights": [1000.0, 2e4, 1000.0, 10.0, 2.0, 0.1],
+            "input_weight": 2e-6,
+            "force_x_max": 55.0,
+            "force_z_min": 10.0,
+            "force_z_max": 290.0,
+            "velocity_gain": 0.05,
+            "apex": 0.07,
+        }.items()
+    },
     "lmpc.control_dt": 0.01,
     "lmpc.model_dt": 0.002,
     "leg.act_dt": 0.005,
@@ -42,13 +60,21 @@ STATIC = {
     "koopman.model", "koopman.dictionary", "koopman.order", "koopman.fourier_count",
     "koopman.fourier_scale", "koopman.fourier_seed", "koopman.constant_rotation", "koopman.feet",
     "koopman.dataset.dt",
-    "gait.trot_flight", "gait.landing_time", "bound.ramp_cycles", "bound.horizon",
+    # Which phases a gait has, and how many cycles its flights grow over.
+    "gait.also", "gaits.trot.offset", "gaits.trot.duty", "gaits.trot.ramp_cycles",
+    "gaits.bound.ramp_cycles", "gaits.bound.horizon",
     "sim.sim_dt", "sim.base", "sim.cone", "sim.contacts", "sim.joint_damping",
     "sim.joint_armature", "sim.contact_threshold", "terrain.kind", "terrain.count",
     "noise.enabled", "noise.force",
 }  # fmt: skip
 # What only means something beside other keys, needs a file, or is a list whose length counts.
-LEFT_OUT = {"koopman.file", "gait.times", "command.times", "push.times", "push.lateral"}
+LEFT_OUT = {
+    "koopman.file", "gait.times", "command.times", "push.times", "push.lateral",
+    "command.v_y", "command.yaw_rate", "command.roll", "command.pitch",
+    "gaits.trot.feet_front", "gaits.trot.feet_rear", "gaits.trot.reference", "gaits.trot.horizon",
+}  # fmt: skip
+# The gaits that are compiled unless a config says otherwise; the keys of the others are the same.
+GAITS = ("gaits.trot.", "gaits.bound.")
 
 
 def another(name, annotation, default):
@@ -69,7 +95,8 @@ def another(name, annotation, default):
 def keys():
     """Every key of a run with another value."""
     for name, info, default in fields(RunConfig):
-        if name not in LEFT_OUT:
+        other = name.startswith("gaits.") and not name.startswith(GAITS)
+        if name not in LEFT_OUT and not other:
             yield name, another(name, info.annotation, default)
 
 
@@ -110,15 +137,14 @@ def test_what_a_batch_may_vary_changes_nothing_in_the_program(base):
 
 
 def test_nodes_of_a_cycle_make_another_program():
-    cycle = {"gait.names": ["bound"], "bound.horizon": "multiphase"}
+    cycle = {"gait.names": ["bound_multiphase"]}
     specs = [
         scene.batch_spec(load_config(RunConfig, None, cycle | own))
         for own in ({}, {"multiphase.node_dt": 0.025}, {"multiphase.tolerance": 1e-7})
     ]
     assert len(set(specs)) == 3
-    assert specs[0] == scene.batch_spec(
-        load_config(RunConfig, None, cycle | {"multiphase.friction": 0.5, "bound.height": 0.28})
-    )
+    data = {"multiphase.friction": 0.5, "gaits.bound_multiphase.height": 0.28}
+    assert specs[0] == scene.batch_spec(load_config(RunConfig, None, cycle | data))
 
 
 def test_pushes_are_those_of_a_single_run():

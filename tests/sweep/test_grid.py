@@ -19,7 +19,7 @@ high = 0.3
 count = 3
 [set]
 "command.v_x" = [0.0, "= speed"]
-"bound.front_stance" = "= duty * 0.4 / 2 + 0.05"
+"gaits.bound.period" = "= duty * 0.4 / 2 + 0.25"
 """
 
 
@@ -40,7 +40,7 @@ def test_a_grid_is_every_value_with_every_other_and_every_seed(file):
     at[:] = cases.cases
     one = at.reshape(cases.shape)[1, 2, 1]
     assert one.command.v_x == (0.0, 0.4)
-    assert one.bound.front_stance == pytest.approx(0.11, abs=1e-12)
+    assert one.gaits.bound.period == pytest.approx(0.31, abs=1e-12)
     assert (one.seed, one.terrain.seed) == (6, 6)
     dims, values, unit = cases.coords["duty"]
     assert dims == ("duty",)

@@ -131,7 +131,7 @@ def test_a_retrained_model_under_the_same_name_is_refused(file, tmp_path, calls)
 
     def train(value):
         spread = np.full((len(Mode), 6), value)
-        storage.save(model, storage.Stored("residual", 0.005, np.zeros((5, 6, 17)), spread))
+        storage.save(model, storage.Stored("residual", 0.005, np.zeros((len(Mode), 6, 17)), spread))
 
     train(1e-3)
     keys = (

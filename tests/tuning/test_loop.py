@@ -20,21 +20,22 @@ CONFIG = load_config(
         "sim.base": "planar",
         "gait.names": ["trot", "bound"],
         "gait.times": [0.0, 0.1],
-        "gait.stance_time": 0.1,
-        "bound.first_flight": 0.05,
-        "bound.second_flight": 0.05,
-        "bound.ramp_cycles": 2,
+        "gaits.trot.period": 0.2,
+        "gaits.bound.period": 0.25,
+        "gaits.bound.offset": [0.0, 0.0, 0.6, 0.6],
+        "gaits.bound.duty": [0.4, 0.4, 0.2, 0.2],
+        "gaits.bound.ramp_cycles": 2,
         # Over 6 ms at the bound's own weights the loop is chaotic: see the benchmark's README row.
-        "bound.input_weight": 5e-6,
+        "gaits.bound.input_weight": 5e-6,
     },
 )
 KEYS = (
     "lmpc.state_weights",
-    "bound.state_weights",
-    "bound.feet_front",
-    "bound.force_edge",
-    "bound.force_z_min",
-    "bound.velocity_gain",
+    "gaits.bound.state_weights",
+    "gaits.bound.feet_front",
+    "gaits.bound.force_edge",
+    "gaits.bound.force_z_min",
+    "gaits.bound.velocity_gain",
 )
 COUNT = 4
 
@@ -151,8 +152,8 @@ def test_a_foot_lands_where_raiberts_law_says(space, run, scenarios):
     x, com, hip = one.x[tick], scenarios.plant.com[0], go1.PARAMS.hip_pos[0, ::2]
     c, s = np.cos(x[2]), np.sin(x[2])
     along = float(x[0]) + c * (hip[0] - com[0]) - s * (hip[1] - com[1])
-    along += CONFIG.bound.feet_front - hip[0] + x[3] * 0.5 * CONFIG.bound.front_stance
-    along += CONFIG.bound.velocity_gain * (x[3] - one.wanted[tick - 1, 0])
+    along += CONFIG.gaits.bound.feet_front - hip[0] + x[3] * 0.5 * 0.1
+    along += CONFIG.gaits.bound.velocity_gain * (x[3] - one.wanted[tick - 1, 0])
     assert one.feet[tick, 0, 0] == pytest.approx(float(along), abs=1e-12)
 
 

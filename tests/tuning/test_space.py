@@ -11,8 +11,8 @@ from kjax.robots import go1
 from kjax.tuning.space import TUNABLE, build_space, tuned_config
 
 BOUND = load_config(RunConfig, None, {"gait.names": ["bound"]})
-SOME = ("lmpc.state_weights", "lmpc.force_z_min", "leg.velocity_gain", "bound.feet_front",
-        "bound.force_edge", "bound.input_weight", "multiphase.height_time")  # fmt: skip
+SOME = ("lmpc.state_weights", "lmpc.force_z_min", "leg.velocity_gain", "gaits.bound.feet_front",
+        "gaits.bound.force_edge", "gaits.bound.input_weight", "multiphase.height_time")  # fmt: skip
 
 
 def test_the_variables_of_a_config_give_its_own_parameters():
@@ -26,37 +26,55 @@ def test_the_variables_of_a_config_give_its_own_parameters():
 
 
 def test_every_kind_of_number_exists_in_the_config_and_comes_back():
-    free = [key for key in TUNABLE if not key.startswith("srb.")]
+    free = [key for key in TUNABLE if not key.startswith("srb.") and value(BOUND, key) is not None]
+    assert sum(key.startswith("gaits.bound.") for key in free) == 10
     space = build_space(BOUND, free)
-    assert tuned_config(BOUND, space.overrides(space.start)) == pytest.approx(BOUND) or all(
-        np.allclose(getattr(getattr(BOUND, section), name), value, rtol=1e-12)
-        for (section, name), value in (
-            (key.split("."), value) for key, value in space.overrides(space.start).items()
-        )
-    )
+    tuned = tuned_config(BOUND, space.overrides(space.start))
+    for key in free:
+        np.testing.assert_allclose(value(tuned, key), value(BOUND, key), rtol=1e-12)
+
+
+def value(config, key):
+    for part in key.split("."):
+        config = getattr(config, part)
+    return config
+
+
+def test_a_gait_of_ones_own_may_be_tuned():
+    config = load_config(RunConfig, None, {"gaits.own.height": 0.26, "gait.names": ["own"]})
+    space = build_space(config, ["gaits.own.height"])
+    params = space.params({"gaits.own.height": jnp.log(0.25)})
+    np.testing.assert_allclose(params.height, [0.27, 0.27, 0.27, 0.25], rtol=1e-6)
+    with pytest.raises(ValueError, match=r"gaits\.own\.apex' is no variable"):
+        build_space(config, ["gaits.own.apex"])
+    with pytest.raises(ValueError, match=r"gaits\.own\.state_weights is not given by the config"):
+        build_space(config, ["gaits.own.state_weights"])
 
 
 def test_a_tuned_config_holds_the_new_values_and_no_others():
-    new = tuned_config(BOUND, {"bound.force_edge": 0.4, "lmpc.state_weights": [1.0] * 6})
-    assert new.bound.force_edge == 0.4
+    new = tuned_config(BOUND, {"gaits.bound.force_edge": 0.4, "lmpc.state_weights": [1.0] * 6})
+    assert new.gaits.bound.force_edge == 0.4
     assert new.lmpc.state_weights == (1.0,) * 6
-    assert new.bound == dataclasses.replace(BOUND.bound, force_edge=0.4)
+    assert new.gaits.bound == dataclasses.replace(BOUND.gaits.bound, force_edge=0.4)
     assert new.command == BOUND.command
 
 
 def test_a_step_of_a_tenth_is_ten_per_cent_of_a_weight():
-    space = build_space(BOUND, ["bound.state_weights"])
+    space = build_space(BOUND, ["gaits.bound.state_weights"])
     moved = {key: one + 0.1 for key, one in space.start.items()}
-    ratio = np.array(space.overrides(moved)["bound.state_weights"]) / BOUND.bound.state_weights
+    own = BOUND.gaits.bound.state_weights
+    ratio = np.array(space.overrides(moved)["gaits.bound.state_weights"]) / own
     np.testing.assert_allclose(ratio, np.exp(0.1), rtol=1e-12)
 
 
 def test_variables_are_brought_back_into_what_a_config_may_hold():
-    space = build_space(BOUND, ["bound.force_edge", "bound.velocity_gain"])
+    space = build_space(BOUND, ["gaits.bound.force_edge", "gaits.bound.velocity_gain"])
     far = {key: one + 100.0 for key, one in space.start.items()}
     inside = space.overrides(space.inside(far))
-    assert inside["bound.force_edge"] == pytest.approx(TUNABLE["bound.force_edge"].high)
-    assert inside["bound.velocity_gain"] == pytest.approx(TUNABLE["bound.velocity_gain"].high)
+    assert inside["gaits.bound.force_edge"] == pytest.approx(TUNABLE["gaits.bound.force_edge"].high)
+    assert inside["gaits.bound.velocity_gain"] == pytest.approx(
+        TUNABLE["gaits.bound.velocity_gain"].high
+    )
     tuned_config(BOUND, inside)  # is valid
 
 

@@ -46,7 +46,7 @@ def test_the_figure_knows_the_height_and_the_stride_of_the_gait_that_is_walked(
         close(fig)
 
     monkeypatch.setattr(plots.plt, "close", look)
-    bound = load_config(RunConfig, None, {"bound.height": 0.301})
+    bound = load_config(RunConfig, None, {"gaits.bound.height": 0.301})
     half = np.arange(len(run.time)) >= len(run.time) // 2
     switched = dataclasses.replace(run, gait=np.where(half, 1, 0))
     plots.closed_loop_figure(switched, bound, tmp_path / "figure.png")

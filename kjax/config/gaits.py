@@ -1,0 +1,254 @@
+"""Gaits as data: when each leg stands, and how the LMPC and the legs walk it.
+
+``[gaits.NAME]`` of a config changes an entry of the library or adds one of its own. Any offset,
+duty factor and period is a gait: no code knows one by its name.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, GetCoreSchemaHandler, TypeAdapter, model_validator
+from pydantic.dataclasses import dataclass
+from pydantic_core import core_schema
+
+from kjax.config.checks import (
+    FOOT_DISTANCE,
+    FORCE,
+    GAIN,
+    HEIGHT,
+    MIN_FORCE,
+    STRICT,
+    WEIGHT,
+    NonNegative,
+    Positive,
+    Tunable,
+)
+
+Offset = Annotated[float, Field(ge=0, lt=1)]
+Duty = Annotated[float, Field(gt=0, le=1)]
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class GaitConfig:
+    """A gait; the defaults are the trot's."""
+
+    period: Positive = 0.5
+    """Duration of a cycle, flights at full length [s]."""
+    offset: tuple[Offset, Offset, Offset, Offset] = (0.0, 0.5, 0.5, 0.0)
+    """Touchdown of FR, FL, RR, RL, part of the cycle [-]."""
+    duty: tuple[Duty, Duty, Duty, Duty] = (0.5, 0.5, 0.5, 0.5)
+    """Duty factor: part of the cycle in which each of them stands [-]."""
+    ramp_start: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Length of the flights in the first cycle, as a fraction of the full one [-]."""
+    ramp_cycles: Annotated[int, Field(ge=0)] = 0
+    """Number of cycles over which the flights grow to their full length [-]."""
+    switch_rule: Literal["anywhere", "first_flight", "cycle_end"] = "anywhere"
+    """When it may be left: at once, as the first flight of its cycle begins (in a bound Raibert's
+    rule: no foot is kicked into the ground that carries no weight), or at the cycle's end [-]."""
+    leave_through: str = ""
+    """Name of a gait that is walked for a cycle when this one is left, such as a landing [-]."""
+    horizon: Literal["stance", "multiphase"] = "stance"
+    """What the prediction covers: the present stance (the paper), or a whole cycle, flights and
+    next stances included ([multiphase]) [-]."""
+    reference: Literal["constant", "periodic"] = "constant"
+    """Reference of height and pitch: constant (the paper), or the cycle's own motion [-]."""
+    force_edge: Annotated[float, Field(gt=0, le=0.5), Tunable(low=0.02, high=0.5)] = 0.25
+    """Part of a stance in which the periodic reference's force rises, and again falls [-]."""
+    height: Annotated[float | None, Field(gt=0), HEIGHT] = None
+    """Reference height of the centre of mass above the ground, mean of the stances; lmpc.height if
+    not given [m]."""
+    state_weights: Annotated[
+        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative] | None,
+        WEIGHT,
+    ] = None
+    """Q of (p_x, p_z, theta, v_x, v_z, omega), of a step, or with a multi-phase horizon per second;
+    the lmpc's if not given [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
+    input_weight: Annotated[float | None, Field(gt=0), WEIGHT] = None
+    """R of every force, likewise [1/N^2]."""
+    force_x_max: Annotated[float | None, Field(ge=0, allow_inf_nan=True), FORCE] = None
+    """Bound of |F_x| per leg, body frame; world frame with a multi-phase horizon; the lmpc's if not
+    given [N]."""
+    force_z_min: Annotated[float | None, Field(allow_inf_nan=True), MIN_FORCE] = None
+    """Lower bound of F_z per leg, likewise [N]."""
+    force_z_max: Annotated[float | None, Field(allow_inf_nan=True), FORCE] = None
+    """Upper bound of F_z per leg, likewise [N]."""
+    feet_front: Annotated[float | None, Field(gt=0), FOOT_DISTANCE] = None
+    """Distance of the front footholds ahead of the centre of mass, standing still; below the hips
+    if not given [m]."""
+    feet_rear: Annotated[float | None, Field(gt=0), FOOT_DISTANCE] = None
+    """Distance of the rear footholds behind the centre of mass, likewise [m]."""
+    velocity_gain: Annotated[float | None, Field(ge=0), GAIN] = None
+    """Raibert gain on the velocity error in the foothold; leg.velocity_gain if not given [s]."""
+    apex: Annotated[float | None, Field(gt=0)] = None
+    """Height of the swing above the higher of lift-off and target; leg.apex if not given [m]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "GaitConfig":
+        if (self.feet_front is None) != (self.feet_rear is None):
+            raise ValueError("feet_front and feet_rear belong together: give both or neither")
+        if self.horizon == "multiphase" and self.feet_front is None:
+            raise ValueError("horizon = 'multiphase' needs feet_front and feet_rear")
+        return self
+
+
+_BOUND: dict[str, Any] = {
+    "period": 0.35,
+    "offset": (0.0, 0.0, 4 / 7, 4 / 7),  # the paper's: 100 ms, flight of 100, 50, flight of 100
+    "duty": (2 / 7, 2 / 7, 1 / 7, 1 / 7),
+    "ramp_start": 0.3,
+    "ramp_cycles": 10,
+    "switch_rule": "first_flight",
+    "reference": "periodic",
+    "height": 0.27,
+    "state_weights": (1084.0, 1211.0, 60.0, 3.06, 3.05, 0.1),
+    "input_weight": 5.7e-7,
+    "force_x_max": 51.5,
+    "force_z_min": 20.0,  # a foot that carries no weight slips
+    "force_z_max": 300.0,
+    "feet_front": 0.075,
+    "feet_rear": 0.148,
+    "velocity_gain": 0.075,
+    "apex": 0.064,
+}
+
+LIBRARY: dict[str, GaitConfig] = {
+    "trot": GaitConfig(),
+    "flying_trot": GaitConfig(period=0.6, duty=(5 / 12,) * 4),
+    "bound": GaitConfig(**_BOUND),
+    "bound_multiphase": GaitConfig(
+        **_BOUND
+        | {
+            "horizon": "multiphase",
+            "state_weights": (63.6, 190.0, 10.4, 29.0, 1.57, 0.22),
+            "input_weight": 5.26e-5,
+            "force_x_max": 90.0,
+            "force_z_min": 10.0,
+            "force_z_max": 340.0,
+            "feet_front": 0.0471,
+            "feet_rear": 0.1853,
+            "height": 0.301,
+            "velocity_gain": 0.0875,
+            "apex": 0.07,
+        }
+    ),
+    "stand": GaitConfig(period=1.0, duty=(1.0,) * 4),
+    "landing": GaitConfig(period=0.05, duty=(1.0,) * 4, switch_rule="cycle_end"),
+    "pace": GaitConfig(period=0.2, offset=(0.0, 0.5, 0.0, 0.5)),
+    "pronk": GaitConfig(
+        period=0.25,
+        offset=(0.0,) * 4,
+        duty=(0.6,) * 4,
+        ramp_start=0.3,
+        ramp_cycles=6,
+        reference="periodic",
+    ),
+    "walk": GaitConfig(period=0.8, offset=(0.5, 0.0, 0.25, 0.75), duty=(0.75,) * 4),
+}
+
+
+class Gaits(Mapping[str, GaitConfig]):
+    """The gaits of a config, by name; an immutable, hashable mapping. ``gaits.trot`` works too."""
+
+    def __init__(self, entries: Mapping[str, GaitConfig] | None = None):
+        """The library, with these entries in place of, or besides, its own."""
+        self._entries = LIBRARY | dict(entries or {})
+
+    def __getitem__(self, name: str) -> GaitConfig:
+        """The gait of that name; ``KeyError`` if there is none."""
+        return self._entries[name]
+
+    def __getattr__(self, name: str) -> GaitConfig:
+        """Likewise, ``AttributeError``."""
+        try:
+            return self.__dict__["_entries"][name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    def __iter__(self) -> Iterator[str]:
+        """Names."""
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        """Number of gaits."""
+        return len(self._entries)
+
+    def __hash__(self) -> int:
+        """Of names and entries."""
+        return hash(tuple(self._entries.items()))
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all entries are equal, in the same order."""
+        if not isinstance(other, Gaits):
+            return NotImplemented
+        return list(self._entries.items()) == list(other._entries.items())
+
+    def __repr__(self) -> str:
+        """Only what differs from the library."""
+        return f"Gaits({self.changed()!r})"
+
+    def changed(self) -> dict[str, GaitConfig]:
+        """Entries that are not the library's."""
+        return {k: v for k, v in self._entries.items() if LIBRARY.get(k) != v}
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        """Read from tables by name, which ``completed`` has filled up; written likewise."""
+        table = core_schema.dict_schema(
+            core_schema.str_schema(), handler.generate_schema(GaitConfig)
+        )
+        read = core_schema.no_info_after_validator_function(cls, table)
+        return core_schema.json_or_python_schema(
+            json_schema=read,
+            python_schema=core_schema.union_schema([core_schema.is_instance_schema(cls), read]),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda gaits: {name: _dump(own) for name, own in gaits.changed().items()}
+            ),
+        )
+
+
+def completed(tables: Any) -> Any:
+    """``[gaits]`` of a file, each table on top of the library's entry of that name."""
+    if not isinstance(tables, Mapping):
+        return tables
+    return {
+        name: _dump(LIBRARY[name]) | dict(own)
+        if name in LIBRARY and isinstance(own, Mapping)
+        else own
+        for name, own in tables.items()
+    }
+
+
+def setting(config: Any, name: str, key: str) -> Any:
+    """A gait's own value, or that of ``[lmpc]`` or ``[leg]`` where it gives none.
+
+    Args:
+      config: of a run, or an ``Overlay``.
+      name: of the gait.
+      key: of ``GaitConfig``.
+    """
+    own = getattr(config.gaits[name], key)
+    if own is not None:
+        return own
+    section = config.leg if key in ("apex", "velocity_gain") else config.lmpc
+    return getattr(section, key)
+
+
+def used(gaits: Gaits, names: Iterable[str]) -> list[str]:
+    """Names of gaits, and of those that they are left through, each once, in order."""
+    out: list[str] = []
+    for name in names:
+        for one in (name, gaits[name].leave_through):
+            if one and one not in out:
+                out.append(one)
+    return out
+
+
+def dump_used(gaits: Gaits, names: Iterable[str]) -> dict[str, Any]:
+    """Plain data of the gaits that are used, or are not the library's."""
+    return {name: _dump(gaits[name]) for name in dict.fromkeys([*names, *gaits.changed()])}
+
+
+def _dump(gait: GaitConfig) -> dict[str, Any]:
+    return TypeAdapter(GaitConfig).dump_python(gait, mode="json")
