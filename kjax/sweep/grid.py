@@ -4,6 +4,7 @@ import ast
 import difflib
 import math
 import operator
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from kjax.config import AxisConfig, ConfigError, RunConfig, SweepConfig, load_config
+from kjax.robots import go1
 from kjax.sim.episode import metric_names
+from kjax.walkable import check_walkable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +43,8 @@ def plan(sweep: SweepConfig, file: Path) -> Plan:
       file: that it came from; ``base`` is seen from there.
 
     Raises:
-      ConfigError: naming the key that no run can be made of, or that no figure can be drawn of.
+      ConfigError: naming the key that no run can be made of, or that no figure can be drawn of,
+        or the point at which the robot cannot walk.
     """
     seeds = np.arange(sweep.first_seed, sweep.first_seed + sweep.seeds)
     names = tuple(sweep.axes)
@@ -72,6 +76,7 @@ def plan(sweep: SweepConfig, file: Path) -> Plan:
         for seed in seeds:
             own = {**keys, "seed": int(seed), "terrain.seed": int(seed)}
             cases.append(_load(base, own, point, file))
+        _check_walkable(cases[-1], point, file)
     _check_figure(sweep, dims, cases, file)
     coords["seed"] = (("seed",), seeds, "-")
     return Plan(dims=(*dims, "seed"), coords=coords, shape=(*shape, len(seeds)), cases=cases)
@@ -102,6 +107,16 @@ def _load(base: Path, keys: Mapping[str, Any], point: Mapping[str, Any], file: P
     try:
         return load_config(RunConfig, base, keys)
     except ConfigError as error:
+        where = ", ".join(f"{name} = {value}" for name, value in point.items())
+        raise ConfigError(f"{file}: at {where}: {error}") from None
+
+
+def _check_walkable(config: RunConfig, point: Mapping[str, Any], file: Path) -> None:
+    """Refuse a point before anything walks, not when its turn comes."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # each is told when its walk begins
+            check_walkable(config, go1.PARAMS)
+    except ValueError as error:
         where = ", ".join(f"{name} = {value}" for name, value in point.items())
         raise ConfigError(f"{file}: at {where}: {error}") from None
 

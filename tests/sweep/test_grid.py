@@ -70,15 +70,25 @@ def test_a_sample_is_drawn_from_the_ranges_and_again_the_same(file):
         ('"= speed"', '"= sped"', r"set\.command\.v_x: no axis named 'sped'"),
         ('"= speed"', '"= __import__(1)"', r"wanted numbers, axes and"),
         ('"= speed"', '"= speed +"', r"wanted numbers, axes and"),
+        (
+            "duty * 0.4",
+            "-2 + duty * 0.4",
+            r"at speed = 0\.2, duty = 0\.1: .*gaits\.bound\.period: got .*greater than 0",
+        ),
+        (
+            "duty * 0.4",
+            "0.02 * duty - 0.46",
+            r"at speed = 0\.2, duty = 0\.1: gaits\.bound: offset and duty leave a .* shorter than",
+        ),
         ('"= speed"', '"fast"', r"at speed = 0\.2.*command\.v_x"),
         ('"command.v_x"', '"command.velocity"', r"command\.velocity: unknown key"),
         (
             "duty * 0.4",
             "0.4 / (duty - 0.1)",
-            r"bound\.front_stance: got '= 0\.4 / \(duty - 0\.1\) .*"
+            r"gaits\.bound\.period: got '= 0\.4 / \(duty - 0\.1\) .*"
             r"divides by zero at speed = 0\.2, duty = 0\.1",
         ),
-        ("duty * 0.4", "1e308 * 1e308 * duty", r"front_stance: got .* no finite number at speed"),
+        ("duty * 0.4", "1e308 * 1e308 * duty", r"bound\.period: got .* no finite number at speed"),
         ("count = 3", "", r"axes\.duty: a grid needs a count"),
         ("values = [0.2, 0.4]", "", r"axes\.speed: give either values, or low and high"),
         ("high = 0.3", "high = 0.05", r"low must be below high"),
