@@ -39,7 +39,6 @@ def build_gaits(config: RunConfig | Overlay) -> list[gait.Gait]:
     """
     chosen, gaits = config.gait, config.gaits
     names = list(dict.fromkeys([*chosen.also, *chosen.names]))
-    names += [name for name in used(gaits, names) if name not in names]
     return [
         gait.Gait(
             name,
@@ -49,7 +48,7 @@ def build_gaits(config: RunConfig | Overlay) -> list[gait.Gait]:
             switch_rule=one.switch_rule,
             leave_through=one.leave_through,
         )
-        for name, one in ((name, gaits[name]) for name in names)
+        for name, one in ((name, gaits[name]) for name in used(gaits, names))
     ]
 
 
@@ -121,10 +120,11 @@ def _check_timing(config: RunConfig, one: gait.Gait) -> None:
                 f"lmpc.control_dt {tick:g} s"
             )
     ends = [(any(phase.stance[:2]), any(phase.stance[2:])) for phase in one.phases]
-    if own.horizon == "multiphase" and (True, True) in ends:
+    once = sorted(end for end in ends if any(end)) == [(False, True), (True, False)]
+    if own.horizon == "multiphase" and not once:
         raise ValueError(
-            f"{name}.horizon = 'multiphase' takes no phase in which front and rear legs stand at "
-            "once; set horizon = 'stance', or another offset and duty"
+            f"{name}.horizon = 'multiphase' takes one phase in which front legs stand and one in "
+            "which rear legs do; set horizon = 'stance', or another offset and duty"
         )
     modes = [contact_mode(phase.stance) for phase in one.phases]
     if own.reference == "periodic" and not has_periodic_reference(modes):

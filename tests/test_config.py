@@ -19,7 +19,7 @@ from kjax.config import (
     load_config,
     to_dict,
 )
-from kjax.config.gaits import LIBRARY, setting
+from kjax.config.gaits import LIBRARY, setting, used
 
 
 def message(overrides, cls=RunConfig, path=None):
@@ -257,3 +257,18 @@ def test_the_shipped_configs_load(name, repository):
     config = load_config(cls, repository / "configs" / name)
     if name in ("trot_velocity.toml", "trot_velocity_long.toml"):
         assert config.duration == 22.0
+
+
+def test_what_a_gait_is_left_through_is_compiled_in_however_far_it_goes():
+    keys = {"gaits.bound.leave_through": "landing", "gaits.landing.leave_through": "walk"}
+    gaits = load_config(RunConfig, None, keys).gaits
+    assert used(gaits, ["bound", "trot"]) == ["bound", "trot", "landing", "walk"]
+
+
+def test_names_of_earlier_versions_say_what_has_become_of_them():
+    with pytest.raises(ImportError, match=r"BoundConfig has gone: gaits are data.*LIBRARY"):
+        from kjax.config import BoundConfig  # noqa: F401
+    with pytest.raises(ImportError, match=r"kjax\.gait\.trot has gone: gaits are data"):
+        from kjax.gait import trot  # noqa: F401
+    with pytest.raises(ImportError, match="cannot import name 'gallop'"):
+        from kjax.gait import gallop  # noqa: F401

@@ -78,7 +78,12 @@ def test_a_height_that_the_legs_do_not_reach_is_refused(gait, key, height):
         (
             {"gait.names": ["own"], "gaits.own.horizon": "multiphase", "gaits.own.feet_front": 0.1,
              "gaits.own.feet_rear": 0.1},
-            r"own\.horizon = 'multiphase' takes no phase in which front and rear legs stand",
+            r"own\.horizon = 'multiphase' takes one phase in which front legs stand and one",
+        ),
+        (
+            {"gait.names": ["bound_multiphase"],
+             "gaits.bound_multiphase.offset": [0.0, 0.05, 4 / 7, 4 / 7]},
+            r"bound_multiphase\.horizon = 'multiphase' takes one phase in which front legs",
         ),
         ({"gaits.trot.reference": "periodic"}, r"trot\.reference = 'periodic' needs .* lift off"),
         ({"gaits.trot.switch_rule": "first_flight"}, r"trot\.switch_rule = .* has no flight"),

@@ -48,3 +48,12 @@ __all__ = [
     "to_dict",
     "tunable",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name == "BoundConfig":
+        raise ImportError(
+            "kjax.config.BoundConfig has gone: gaits are data, kjax.config.GaitConfig and "
+            "kjax.config.gaits.LIBRARY['bound']"
+        )
+    raise AttributeError(f"module 'kjax.config' has no attribute '{name}'")

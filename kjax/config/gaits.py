@@ -237,11 +237,11 @@ def setting(config: Any, name: str, key: str) -> Any:
 
 def used(gaits: Gaits, names: Iterable[str]) -> list[str]:
     """Names of gaits, and of those that they are left through, each once, in order."""
-    out: list[str] = []
-    for name in names:
-        for one in (name, gaits[name].leave_through):
-            if one and one not in out:
-                out.append(one)
+    out = list(dict.fromkeys(names))
+    for name in out:  # which grows on the way
+        through = gaits[name].leave_through
+        if through and through not in out:
+            out.append(through)
     return out
 
 

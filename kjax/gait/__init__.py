@@ -31,3 +31,14 @@ __all__ = [
     "start",
     "time_to_touchdown",
 ]
+
+_GONE = ("trot", "bound", "stand")
+
+
+def __getattr__(name: str) -> object:
+    if name in _GONE:
+        raise ImportError(
+            f"kjax.gait.{name} has gone: gaits are data, kjax.config.gaits.LIBRARY['{name}']; "
+            "their phases are gait.phases(period, offset, duty)"
+        )
+    raise AttributeError(f"module 'kjax.gait' has no attribute '{name}'")

@@ -162,7 +162,8 @@ def _check_array(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name} holds values of type {values.dtype}, wanted real numbers")
     if shape and values.ndim == len(shape) and len(values) != len(Mode):
-        raise ValueError(f"{name} holds {len(values)} contact modes, wanted {len(Mode)}")
+        text = f"{name} holds {len(values)} contact modes, wanted {len(Mode)}"
+        raise ValueError(text + ": fit it again, kjax had 5 before" * (len(values) == 5))
     if values.shape != shape:
         raise ValueError(f"{name} has shape {values.shape}, wanted {shape}")
     if not np.isfinite(values).all():

@@ -160,6 +160,7 @@ def test_a_damaged_byte_is_refused_or_does_not_matter(tmp_path, stored, family):
         ({"W": np.zeros((M, 6, 28))}, f"W has shape ({M}, 6, 28), wanted ({M}, 6, 29)"),
         ({"W": np.zeros((M, 5, 29))}, f"W has shape ({M}, 5, 29), wanted ({M}, 6, 29)"),
         ({"W": np.zeros((6, 29))}, f"W has shape (6, 29), wanted ({M}, 6, 29)"),
+        ({"W": np.zeros((5, 6, 29))}, f"W holds 5 contact modes, wanted {M}: fit it again"),
         ({"W": np.zeros((3, 6, 29))}, f"W holds 3 contact modes, wanted {M}"),
         ({"W": np.zeros((M, 6, 29), complex)}, "W holds complex numbers"),
         ({"W": np.full((M, 6, 29), "a")}, "W holds values of type <U1"),
