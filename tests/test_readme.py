@@ -13,7 +13,7 @@ from kjax.sim.observe import find_addresses
 from kjax.sim.scene import build_model
 
 PAGES = ("README.md", *(f"docs/{name}.md" for name in (
-    "results", "your_own_loop", "sweeps", "qp", "models", "tuning",
+    "results", "your_own_loop", "gaits", "sweeps", "qp", "models", "tuning",
 )))  # fmt: skip
 
 

@@ -49,6 +49,6 @@ def perturb(
       noise: added (x, z) at the front and the rear [N].
     """
     noise = jnp.repeat(noise.astype(force.dtype).reshape(2, 2), 2, axis=0)
-    added = force.at[:, ::2].add(noise)
+    added = jnp.asarray(force).at[:, ::2].add(noise)
     added = added.at[:, 2].max(0.0)
     return jnp.where(stance[:, None], added, force)

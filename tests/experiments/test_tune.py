@@ -60,10 +60,9 @@ def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(t
         (["--keys", "lmpc.weights"], "--keys: 'lmpc.weights' is no variable"),
         (["--scenarios", "0"], "--scenarios: got 0, wanted more than 0"),
         (["--sim.base", "free"], "wanted 'planar'"),
-        (["--gait.names", "['stand']"], "gait.names: got 'stand'"),
         (["--worsn", "3"], "did you mean --worsen"),
     ],
-    ids=["key", "count", "base", "gait", "option"],
+    ids=["key", "count", "base", "option"],
 )
 def test_a_mistake_is_one_line(tune, tmp_path, words, text):
     done = tune("configs/trot_velocity.toml", *words, "--out", str(tmp_path))

@@ -67,7 +67,7 @@ def test_samples_fill_their_ranges_and_stay_inside(snapshots, snapshots_moving_f
 
 
 def test_contact_points_stay_put_unless_asked_to_vary(snapshots, body):
-    np.testing.assert_array_equal(snapshots.feet, np.broadcast_to(body.feet, (5, 40, 2, 2)))
+    np.testing.assert_array_equal(snapshots.feet, np.broadcast_to(body.feet, (len(Mode), 40, 2, 2)))
     still = dataset.ranges_from_config(DatasetConfig(), vary_feet=False)
     np.testing.assert_array_equal(still.feet_half, 0.0)
 

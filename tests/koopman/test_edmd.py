@@ -202,7 +202,7 @@ def test_data_that_is_not_finite_is_reported_and_spoils_its_own_mode_only(
     states = np.array(snapshots.states)
     states[Mode.REAR, 3, when, 5] = np.nan
     model, report = fit_modes()(snapshots._replace(states=states))
-    expected = np.arange(5) != Mode.REAR
+    expected = np.arange(len(Mode)) != Mode.REAR
     np.testing.assert_array_equal(report.finite, expected)
     np.testing.assert_array_equal(np.asarray(model.A)[expected], np.asarray(fitted[0].A)[expected])
 
@@ -218,7 +218,7 @@ def test_constant_data_is_reported_as_rank_one(fit_modes, snapshots):
     assert np.asarray(report.finite).all()
     # Nothing moved: the minimum-norm answer is no increment. Rounding of one row.
     np.testing.assert_allclose(
-        model.A, np.broadcast_to(np.eye(15), (5, 15, 15)), rtol=0, atol=1e-12
+        model.A, np.broadcast_to(np.eye(15), (len(Mode), 15, 15)), rtol=0, atol=1e-12
     )
 
 

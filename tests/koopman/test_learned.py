@@ -112,7 +112,9 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     config = KoopmanConfig(model="learned", file=str(path))
     assert prediction.build_family(prediction.model_spec(config)).size == 8
     body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
-    built = prediction.build_prediction(body, config, jax.random.key(0), height=0.27)
+    built = prediction.build_prediction(
+        body, config, jax.random.key(0), modes=tuple(Mode), heights=(0.27,) * len(Mode)
+    )
     np.testing.assert_array_equal(built.spread, spread)
 
 
@@ -121,9 +123,9 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     [
         ({"family": "residual"}, "holds residual, wanted a learned model"),
         ({"A": None}, "lacks 'A'"),
-        ({"centre": np.full((5, 6), np.nan)}, "centre holds numbers that are not finite"),
+        ({"centre": np.full((len(Mode), 6), np.nan)}, "centre holds numbers that are not finite"),
         ({"dt": 0.005}, "steps of 0.005 s, koopman.dataset.dt is 0.001 s"),
-        ({"spread": np.zeros((3, 6))}, "holds 3 contact modes, wanted 5"),
+        ({"spread": np.zeros((3, 6))}, f"holds 3 contact modes, wanted {len(Mode)}"),
     ],
 )
 def test_a_file_that_is_no_such_model_is_refused(trained, tmp_path, change, message):
