@@ -217,7 +217,7 @@ def worsened(space: Space, factor: float, seed: int) -> Variables:
     rng = np.random.default_rng(seed)
     out = {}
     for key, one in space.start.items():
-        if TUNABLE[key].unit is None:
+        if space.kinds[key].unit is None:
             out[key] = one + np.log(factor) * rng.choice([-1.0, 1.0], np.shape(one))
         else:
             out[key] = one / factor

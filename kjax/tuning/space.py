@@ -32,13 +32,15 @@ class Space(NamedTuple):
     """Variables of some keys of a config; a record of pure functions.
 
     Attributes:
+      kinds: in which coordinate and range each key is tuned.
       start: variables of the config itself.
       values: variables -> numbers by key.
-      inside: variables -> the nearest ones in the ranges of ``TUNABLE``.
+      inside: variables -> the nearest ones in their ranges.
       params: variables -> controller parameters; differentiable.
       overrides: variables -> plain values by key, for ``config.load_config`` and TOML.
     """
 
+    kinds: dict[str, Tunable]
     start: Variables
     values: Callable[[Variables], dict[str, Array]]
     inside: Callable[[Variables], Variables]
@@ -127,7 +129,7 @@ def build_space(
         if kinds[key].unit is None and not (number > 0).all():
             raise ValueError(f"{key} must be positive to be tuned, got {number.tolist()}")
         start[key] = jnp.asarray(_forward(kinds[key], number), dtype)
-    return Space(start, values, inside, params, overrides)
+    return Space({key: kinds[key] for key in keys}, start, values, inside, params, overrides)
 
 
 def tuned_config(config: RunConfig, overrides: Mapping[str, Any]) -> RunConfig:

@@ -45,6 +45,7 @@ def test_a_gait_of_ones_own_may_be_tuned():
     space = build_space(config, ["gaits.own.height"])
     params = space.params({"gaits.own.height": jnp.log(0.25)})
     np.testing.assert_allclose(params.height, [0.27, 0.27, 0.27, 0.25], rtol=1e-6)
+    assert space.kinds == {"gaits.own.height": TUNABLE["gaits.trot.height"]}
     with pytest.raises(ValueError, match=r"gaits\.own\.apex' is no variable"):
         build_space(config, ["gaits.own.apex"])
     with pytest.raises(ValueError, match=r"gaits\.own\.state_weights is not given by the config"):
