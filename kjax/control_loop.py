@@ -92,7 +92,7 @@ class ControlLoop:
         self._periods, self._told = [], False
 
     def step(self, observation: Observation, time: float) -> JointCommand:
-        """Torques and joint loops, NumPy arrays (4, 3): abduction, thigh, calf of FR, FL, RR, RL.
+        """Torques and PD loops, NumPy arrays (4, 3): abduction, thigh, calf of FR, FL, RR, RL.
 
         Args:
           observation: of the robot now.

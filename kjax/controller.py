@@ -239,19 +239,19 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
 
         # Step 3: torques, those of the last valid sample for a while, then damping.
         legs = LegCommand(state.stance & ~swings.reaching, state.force, foot, foot_vel)
-        loops = base.joints(robot, settings, sideways, view, legs, observation)
+        targets = base.joints(robot, settings, sideways, view, legs, observation)
         blind_time = jnp.where(valid, 0.0, state.blind_time + act_dt)
         recent = blind_time < params.hold_time + 0.5 * act_dt
         held = jnp.where(recent, state.torque, -params.blind_damping * joint_vel)
-        torque = jnp.where(valid, loops.torque, held)
+        torque = jnp.where(valid, targets.torque, held)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
-        follows, damped = loops.follows & valid, ~valid & ~recent
+        tracks, damped = targets.tracks & valid, ~valid & ~recent
         command = _joint_command(
             torque,
-            q=jnp.where(follows, loops.q, observation.joint_pos),
-            dq=jnp.where(follows, loops.dq, jnp.where(damped, 0.0, joint_vel)),
-            kp=jnp.where(follows, settings.kp, 0.0),
-            kd=jnp.where(follows, settings.kd, jnp.where(damped, params.blind_damping, 0.0)),
+            q=jnp.where(tracks, targets.q, observation.joint_pos),
+            dq=jnp.where(tracks, targets.dq, jnp.where(damped, 0.0, joint_vel)),
+            kp=jnp.where(tracks, settings.kp, 0.0),
+            kd=jnp.where(tracks, settings.kd, jnp.where(damped, params.blind_damping, 0.0)),
             joint_pos=observation.joint_pos,
             joint_vel=joint_vel,
         )
@@ -340,6 +340,6 @@ def _joint_command(
     joint_pos: Array,
     joint_vel: Array,
 ) -> JointCommand:
-    """The torques, and joint loops that give them for this sample; all (4, 3)."""
+    """The torques, and PD loops of the joints that give them for this sample; all (4, 3)."""
     feedforward = torque - (kp * (q - joint_pos) + kd * (dq - joint_vel))
     return JointCommand(torque=torque, q=q, dq=dq, kp=kp, kd=kd, feedforward=feedforward)

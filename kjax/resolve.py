@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from kjax import gait
 from kjax.config import CommandConfig, KoopmanConfig, Overlay, RunConfig
-from kjax.config.gaits import setting, used
+from kjax.config.gaits import gait_setting, reachable_gaits
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import Point, fit_modes, stack_bodies
 from kjax.koopman.prediction import build_prediction, model_spec
@@ -23,7 +23,7 @@ from kjax.legs import lateral, swing
 from kjax.mpc import multiphase
 from kjax.mpc.lmpc import ModeSettings
 from kjax.params import ControllerParams, Fits
-from kjax.rigid_body import body_numbers, mean_force, own_body
+from kjax.rigid_body import body_numbers, levers, mean_force, own_body
 from kjax.spec import ControllerSpec, CycleSpec
 from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
 from kjax.walkable import Problem, build_gaits, check_walkable, contact_problems, cycle_nodes
@@ -115,7 +115,7 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
     feet = tuple(_nominal_feet(config, robot, name) for name in names)
     modes = tuple(problem.mode for problem in problems)
     hover = config.koopman.model == "srb_hover"
-    heights = tuple(setting(config, name, "height") if hover else 0.0 for name in names)
+    heights = tuple(gait_setting(config, name, "height") if hover else 0.0 for name in names)
     # What a file holds may have changed since.
     fit = _fit.__wrapped__ if config.koopman.file else _fit
     mass, inertia = (float(number) for number in body_numbers(config, robot))
@@ -124,7 +124,7 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
 
 def _nominal_feet(config: RunConfig, robot: RobotParams, name: str) -> tuple[Point, Point]:
     """Contact points (x, z) of front and rear legs from the centre of mass, standing still [m]."""
-    own, height = config.gaits[name], setting(config, name, "height")
+    own, height = config.gaits[name], gait_setting(config, name, "height")
     if own.feet_front is None or own.feet_rear is None:
         body = own_body(config.srb, robot, height)
         assert body.feet_front is not None  # own_body filled them in
@@ -160,7 +160,7 @@ def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
     if config.koopman.model != "linear":
         return
     gaits = build_gaits(config)
-    walked = used(config.gaits, config.gait.names)
+    walked = reachable_gaits(config.gaits, config.gait.names)
     mass, inertia = (float(number) for number in body_numbers(config, robot))
     bodies = jax.device_get(stack_bodies(mass, inertia, fits.feet))
     duration = config.lmpc.model_dt * config.lmpc.horizon
@@ -192,16 +192,12 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
     names = [one.name for one in gaits]
     leg, sideways = config.leg, config.lateral
     foresees = cycle_nodes(gaits, config).any(axis=1)
-    mass = body_numbers(config, robot)[0]
     problems, index = contact_problems(gaits, config)
-
-    def by_gait(key: str) -> Array:
-        return jnp.stack([jnp.asarray(setting(config, name, key), float) for name in names])
 
     return ControllerParams(
         robot=robot,
         fits=fits,
-        modes=problem_settings(config, problems, names, mean_force(gaits, config, mass)),
+        modes=problem_settings(config, problems, names, mean_force(gaits, config, robot)),
         problem=jnp.asarray(index),
         uncertainty_discount=jnp.asarray(config.lmpc.caution, float),
         friction=jnp.asarray(config.lmpc.friction, float),
@@ -212,8 +208,8 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
         reference=_reference_tables(gaits, config, robot),
         multiphase=multiphase_params(gaits, config, robot),
         swing=swing.SwingParams(
-            apex=by_gait("apex"),
-            velocity_gain=by_gait("velocity_gain"),
+            apex=_column(config, names, "apex"),
+            velocity_gain=_column(config, names, "velocity_gain"),
             offset=jnp.stack([_foothold_offset(robot, config.gaits[name]) for name in names]),
             horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
             hold_after=jnp.asarray(leg.hold_after),
@@ -238,7 +234,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
             foothold_gain=jnp.asarray(sideways.velocity_gain),
         ),
         command=build_command(config.command),
-        height=by_gait("height"),
+        height=_column(config, names, "height"),
         command_slew=jnp.asarray(config.lmpc.command_slew, float),
         height_slew=jnp.asarray(config.lmpc.height_slew, float),
         integral=jnp.stack(
@@ -260,6 +256,11 @@ def build_command(command: CommandConfig) -> Command:
 _fit_modes = jax.jit(fit_modes, static_argnames=("config", "modes"))
 
 
+def _column(config: RunConfig | Overlay, names: Sequence[str], key: str) -> Array:
+    """One setting of several gaits, stacked."""
+    return jnp.stack([jnp.asarray(gait_setting(config, name, key), float) for name in names])
+
+
 def problem_settings(
     config: RunConfig | Overlay,
     problems: Sequence[Problem],
@@ -276,9 +277,7 @@ def problem_settings(
     """
     standing = np.repeat(MODE_ALPHA[[problem.mode for problem in problems]] > 0, 2, axis=1)
 
-    def each(key: str) -> Array:
-        values = [setting(config, names[problem.gait], key) for problem in problems]
-        return jnp.stack([jnp.asarray(value, float) for value in values])
+    own = [names[problem.gait] for problem in problems]
 
     def pair(x: Array, z: Array) -> Array:
         return jnp.tile(jnp.stack([x, z], axis=-1), 2)
@@ -286,12 +285,12 @@ def problem_settings(
     force = mean_force[np.array([problem.gait for problem in problems])]
     hover = jnp.stack([jnp.zeros_like(force), force], axis=-1).reshape(len(problems), 4)
     lower, upper = (
-        pair(sign * each("force_x_max"), each(f"force_z_{end}"))
+        pair(sign * _column(config, own, "force_x_max"), _column(config, own, f"force_z_{end}"))
         for sign, end in ((-1.0, "min"), (1.0, "max"))
     )
     return ModeSettings(
-        state_weights=each("state_weights"),
-        input_weights=jnp.tile(each("input_weight")[:, None], 4),
+        state_weights=_column(config, own, "state_weights"),
+        input_weights=jnp.tile(_column(config, own, "input_weight")[:, None], 4),
         lower=jnp.where(standing, lower, 0.0),
         upper=jnp.where(standing, upper, 0.0),
         input_reference=jnp.where(standing, hover, 0.0),
@@ -305,28 +304,23 @@ def multiphase_params(
     chosen = config.multiphase
     mass, inertia = body_numbers(config, robot)
 
-    def each(key: str) -> Array:
-        values = [setting(config, one.name, key) for one in gaits]
-        return jnp.stack([jnp.asarray(value, float) for value in values])
-
-    feet = []
-    for one in gaits:
-        own = config.gaits[one.name]  # gaits below their hips have no nodes
-        front, rear = own.feet_front, own.feet_rear
-        ends = [1.0, -1.0] if front is None or rear is None else [front, -rear]
-        feet.append(jnp.stack([jnp.asarray(end, float) for end in ends]))
+    names = [one.name for one in gaits]
+    ends = [levers(config.gaits[name], robot) for name in names]
+    feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in ends]
     return multiphase.MultiPhaseParams(
         nodes=jnp.asarray(cycle_nodes(gaits, config)),
-        state_weights=each("state_weights"),
-        input_weight=each("input_weight"),
+        state_weights=_column(config, names, "state_weights"),
+        input_weight=_column(config, names, "input_weight"),
         mass=jnp.asarray(mass),
         inertia=jnp.asarray(inertia * chosen.inertia_scale),
         friction=jnp.asarray(chosen.friction),
         torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
-        force_x_max=each("force_x_max"),
-        force_z=jnp.stack([each("force_z_min"), each("force_z_max")], axis=-1),
+        force_x_max=_column(config, names, "force_x_max"),
+        force_z=jnp.stack(
+            [_column(config, names, "force_z_min"), _column(config, names, "force_z_max")], axis=-1
+        ),
         feet=jnp.stack(feet),
-        velocity_gain=each("velocity_gain"),
+        velocity_gain=_column(config, names, "velocity_gain"),
         velocity_time=jnp.asarray(chosen.velocity_time),
         height_time=jnp.asarray(chosen.height_time),
     )
@@ -344,15 +338,11 @@ def _reference_tables(
         if own.reference != "periodic":
             continue
         modes = [contact_mode(phase.stance) for phase in one.phases]
-        # Below the hips both ends share the weight alike.
-        levers = (own.feet_front, own.feet_rear)
-        if own.feet_front is None:
-            levers = (float(np.abs(robot.hip_pos[:, 0]).mean()),) * 2
         cycles = [
             periodic_reference(
                 np.array(one.durations(min(level, one.ramp_cycles))),
                 modes,
-                *levers,
+                *levers(own, robot),
                 mass,
                 inertia,
                 own.force_edge,

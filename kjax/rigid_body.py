@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kjax.config import Overlay, RunConfig, SrbConfig
+from kjax.config import GaitConfig, Overlay, RunConfig, SrbConfig
 from kjax.gait import Gait
 from kjax.legs import kinematics
 from kjax.observation import standing
@@ -71,28 +71,34 @@ def body_numbers(config: RunConfig | Overlay, robot: RobotParams) -> tuple[Any, 
     )
 
 
-def mean_force(gaits: list[Gait], config: RunConfig | Overlay, mass: Any) -> Float[Array, "G 2"]:
+def levers(own: GaitConfig | Overlay, robot: RobotParams) -> tuple[Any, Any]:
+    """Distances of a gait's front and rear footholds from the centre of mass, standing still [m].
+
+    Below the hips both count as the hips' mean, so that the ends share the weight alike.
+    """
+    if own.feet_front is None or own.feet_rear is None:
+        return (jnp.abs(robot.hip_pos[:, 0]).mean(),) * 2
+    return own.feet_front, own.feet_rear
+
+
+def mean_force(
+    gaits: list[Gait], config: RunConfig | Overlay, robot: RobotParams
+) -> Float[Array, "G 2"]:
     """Vertical force of one front and one rear leg of each gait, mean of its stance [N].
 
     Over a cycle the legs carry the weight and leave no net turn:
-    J_f + J_r = m g T,  J_f l_f = J_r l_r,  each shared by the stances of its legs; the levers are
-    alike where the gait's feet stand below the hips. Zero where the config wants the paper's.
+    J_f + J_r = m g T,  J_f l_f = J_r l_r,  each shared by the stances of its legs. Zero where the
+    config wants the paper's.
     """
     on = float(config.lmpc.input_reference == "mean")
+    weight = body_numbers(config, robot)[0] * GRAVITY
     rows = []
     for one in gaits:
-        own = config.gaits[one.name]
-        front, rear = own.feet_front, own.feet_rear
-        share = 0.5 if front is None or rear is None else rear / (front + rear)
+        front, rear = levers(config.gaits[one.name], robot)
+        shares = jnp.stack([jnp.asarray(end, float) for end in (rear, front)]) / (front + rear)
         standing = [
             sum(phase.duration * sum(phase.stance[i] for i in legs) for phase in one.phases)
             for legs in ((0, 1), (2, 3))
         ]
-        rows.append(
-            [
-                part * one.period / time if time > 0 else 0.0
-                for part, time in zip((share, 1.0 - share), standing, strict=True)
-            ]
-        )
-    table = jnp.stack([jnp.stack([jnp.asarray(part, float) for part in row]) for row in rows])
-    return on * mass * GRAVITY * table
+        rows.append(shares * one.period / jnp.asarray(standing))
+    return on * weight * jnp.stack(rows)

@@ -109,7 +109,6 @@ class RobotParams(NamedTuple):
 
 
 COMMAND_NAMES = ("v_x", "v_y", "yaw_rate", "height", "roll", "pitch")
-COMMAND_UNITS = ("m/s", "m/s", "rad/s", "m", "rad", "rad")
 
 
 class Command(NamedTuple):
@@ -142,8 +141,8 @@ class Command(NamedTuple):
 class JointCommand(NamedTuple):
     """What the joints are told; (leg, joint), legs FR, FL, RR, RL by abduction, thigh, calf.
 
-    A torque-controlled joint takes ``torque``. A motor with its own fast loop takes the other five
-    and gives, for the sample that they were made from, the same:
+    A torque-controlled joint takes ``torque``. A motor with a PD loop of its own takes the other
+    five and gives, for the sample that they were made from, the same:
 
         torque = feedforward + kp (q - joint_pos) + kd (dq - joint_vel)
 
@@ -151,8 +150,8 @@ class JointCommand(NamedTuple):
       torque: within the robot's limits [N m].
       q: angle wanted; the measured one where there is no stiffness [rad].
       dq: rate wanted; the measured one where there is no damping [rad/s].
-      kp: stiffness of the joint's loop; 0 in stance [N m/rad].
-      kd: its damping; 0 in stance [N m s/rad].
+      kp: proportional gain of the PD loop; 0 in stance [N m/rad].
+      kd: its derivative gain; 0 in stance [N m s/rad].
       feedforward: torque besides those [N m].
     """
 

@@ -8,7 +8,7 @@ import numpy as np
 from kjax import gait
 from kjax.command import check_command
 from kjax.config import Overlay, RunConfig
-from kjax.config.gaits import setting, used
+from kjax.config.gaits import gait_setting, reachable_gaits, setting_key
 from kjax.gait.reference import has_periodic_reference
 from kjax.legs.kinematics import REACH
 from kjax.rigid_body import nominal_feet, own_body
@@ -46,9 +46,9 @@ def build_gaits(config: RunConfig | Overlay) -> list[gait.Gait]:
             ramp_start=one.ramp_start,
             ramp_cycles=one.ramp_cycles,
             switch_rule=one.switch_rule,
-            leave_through=one.leave_through,
+            transition_gait=one.transition_gait,
         )
-        for name, one in ((name, gaits[name]) for name in used(gaits, names))
+        for name, one in ((name, gaits[name]) for name in reachable_gaits(gaits, names))
     ]
 
 
@@ -97,7 +97,7 @@ def check_walkable(config: RunConfig, robot: RobotParams) -> None:
     """
     check_command({name: getattr(config.command, name) for name in COMMAND_NAMES})
     _check_body(config, robot)
-    walked = used(config.gaits, config.gait.names)
+    walked = reachable_gaits(config.gaits, config.gait.names)
     for one in build_gaits(config):
         _check_timing(config, one)
         if one.name in walked:
@@ -194,22 +194,22 @@ def _check_weight(config: RunConfig, robot: RobotParams, one: gait.Gait) -> None
     weight = float(robot.mass) * GRAVITY * one.period
     needed = MARGIN * weight
     standing = sum(phase.duration * sum(phase.stance) for phase in one.phases)
-    given, least = (
-        standing * setting(config, one.name, f"force_z_{end}") for end in ("max", "min")
-    )
+    bounds = ("force_z_max", "force_z_min")
+    keys = [setting_key(config, one.name, bound) for bound in bounds]
+    given, least = (standing * gait_setting(config, one.name, bound) for bound in bounds)
     fraction = getattr(config, section).torque_fraction
     strong = standing * fraction * _calf_force(config, robot, one.name)
     cycle = f"in a cycle of {one.name} ({one.period:g} s)"
     mass = f"{float(robot.mass):.4g} kg"
     if given < needed:
         raise ValueError(
-            f"gaits.{one.name}.force_z_max: {cycle} the feet can give {given:.4g} N s, and "
+            f"{keys[0]}: {cycle} the feet can give {given:.4g} N s, and "
             f"{needed:.4g} N s are needed for {mass} ({MARGIN:g} times its weight); raise it by a "
             f"factor of {needed / given:.3g}"
         )
     if MARGIN * least > weight:
         raise ValueError(
-            f"gaits.{one.name}.force_z_min: {cycle} the feet give at least {least:.4g} N s, and "
+            f"{keys[1]}: {cycle} the feet give at least {least:.4g} N s, and "
             f"{mass} weigh {weight:.4g} N s: the robot would fly off; it must be at most "
             f"{weight / (MARGIN * least):.3g} of what it is"
         )
@@ -232,17 +232,17 @@ def _calf_force(config: RunConfig, robot: RobotParams, name: str) -> float:
 
 def _drop(config: RunConfig, robot: RobotParams, name: str) -> float:
     """Depth of the foot centre below the hip at the reference height [m]."""
-    height = float(setting(config, name, "height"))
+    height = float(gait_setting(config, name, "height"))
     return height - float(robot.foot_radius) + float(robot.hip_pos[:, 2].mean())
 
 
 def _check_reach(config: RunConfig, robot: RobotParams, name: str) -> None:
-    height = setting(config, name, "height")
+    height = gait_setting(config, name, "height")
     low, high = np.array(REACH) * float(robot.thigh_length + robot.calf_length)
     drop = _drop(config, robot, name)
     asked = (0.0, *config.command.height)
     if not (low < drop + min(asked) and drop + max(asked) < high):
-        key = f"gaits.{name}.height is {height:g} m"
+        key = f"{setting_key(config, name, 'height')} is {height:g} m"
         if any(asked):
             key += f" and command.height {min(asked):+g} to {max(asked):+g} m"
         raise ValueError(

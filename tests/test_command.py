@@ -53,9 +53,7 @@ def test_what_the_planar_controller_does_not_follow_is_refused_at_the_edge(name)
 @pytest.mark.parametrize("height", [-0.2, 0.2])
 def test_a_height_that_the_legs_do_not_reach_is_refused(height):
     config = load_config(RunConfig, None, {"command.height": [0.0, height, 0.0, 0.0, 0.0]})
-    with pytest.raises(
-        ValueError, match=r"gaits\.trot\.height is 0\.27 m and command\.height .* m; the"
-    ):
+    with pytest.raises(ValueError, match=r"lmpc\.height is 0\.27 m and command\.height .* m; the"):
         resolve(config, go1.PARAMS)
 
 

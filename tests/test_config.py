@@ -9,7 +9,7 @@ from kjax.config import (
     FitStudyConfig,
     GaitConfig,
     Gaits,
-    GaitTimesConfig,
+    GaitScheduleConfig,
     LmpcConfig,
     Overlay,
     RunConfig,
@@ -19,7 +19,7 @@ from kjax.config import (
     load_config,
     to_dict,
 )
-from kjax.config.gaits import LIBRARY, setting, used
+from kjax.config.gaits import LIBRARY, gait_setting, reachable_gaits
 
 
 def message(overrides, cls=RunConfig, path=None):
@@ -64,8 +64,16 @@ def message(overrides, cls=RunConfig, path=None):
         ({"gaits.trot.duty": [0.5, 0.5, 0.5, 1.2]}, ("gaits.trot.duty", "1.2", "or equal to 1")),
         ({"gaits.trot.offset": [0.0, 1.0, 0.0, 0.0]}, ("gaits.trot.offset", "1.0", "less than 1")),
         ({"gaits.trot.feet_front": 0.1}, ("gaits.trot", "feet_front and feet_rear belong")),
-        ({"gaits.trot.horizon": "multiphase"}, ("gaits.trot", "needs feet_front and feet_rear")),
-        ({"gaits.bound.leave_through": "land"}, ("gaits.bound.leave_through", "'landing'")),
+        ({"gaits.trot.horizon": "multiphase"}, ("gaits.trot", "needs feet_front")),
+        (
+            {
+                "gaits.own.horizon": "multiphase",
+                "gaits.own.feet_front": 0.1,
+                "gaits.own.feet_rear": 0.1,
+            },
+            ("gaits.own", "needs state_weights"),
+        ),
+        ({"gaits.bound.transition_gait": "land"}, ("gaits.bound.transition_gait", "'landing'")),
         ({"gait.also": ["walkk"]}, ("gait.also", "'walkk'", "did you mean 'walk'")),
         ({"gaits.own.period": "a"}, ("gaits.own.period", "got 'a'")),
         # Keys of earlier versions
@@ -79,7 +87,7 @@ def message(overrides, cls=RunConfig, path=None):
         ({"gait.stance_time": 0.2}, ("gait.stance_time", "gaits.trot.period")),
         ({"gait.trot_flight": 0.05}, ("gait.trot_flight", "flying_trot")),
         ({"gait.switch_rule": "anywhere"}, ("gait.switch_rule", "gaits.bound.switch_rule")),
-        ({"gait.landing_time": 0.1}, ("gait.landing_time", "leave_through = 'landing'")),
+        ({"gait.landing_time": 0.1}, ("gait.landing_time", "transition_gait = 'landing'")),
         ({"gaits.bound.reference": "none"}, ("gaits.bound.reference", "got 'none'")),
         ({"gaits.bound.force_z_min": 400.0}, ("bound", "force_z_min", "400.0", "300.0")),
         ({"gaits.bound.force_z_max": 10.0}, ("bound", "force_z_min", "20.0", "10.0")),
@@ -196,7 +204,7 @@ def test_building_a_config_in_python_checks_it_too():
     with pytest.raises(ValueError, match="force_z_min must not exceed force_z_max"):
         RunConfig(gaits=Gaits({"trot": GaitConfig(force_z_min=30.0, force_z_max=20.0)}))
     with pytest.raises(ValueError, match="times must increase"):
-        GaitTimesConfig(names=("trot", "bound", "trot"), times=(0.0, 1.0, 1.0))
+        GaitScheduleConfig(names=("trot", "bound", "trot"), times=(0.0, 1.0, 1.0))
 
 
 def test_a_gait_of_a_config_changes_the_librarys_or_is_its_own():
@@ -220,11 +228,12 @@ def test_a_gait_of_a_config_changes_the_librarys_or_is_its_own():
 def test_what_a_gait_does_not_give_is_the_lmpcs_or_the_legs():
     keys = {"lmpc.height": 0.25, "leg.apex": 0.08, "gaits.pace.height": 0.26}
     config = load_config(RunConfig, None, keys)
-    found = {name: setting(config, name, "height") for name in ("trot", "pace", "bound")}
+    found = {name: gait_setting(config, name, "height") for name in ("trot", "pace", "bound")}
     assert found == {"trot": 0.25, "pace": 0.26, "bound": 0.27}
-    assert setting(config, "pronk", "apex") == 0.08
+    assert gait_setting(config, "pronk", "apex") == 0.08
     seen = Overlay(config, {"gaits.pace.height": 0.3, "lmpc.height": 0.2})
-    assert [setting(seen, name, "height") for name in ("trot", "pace", "bound")] == [0.2, 0.3, 0.27]
+    heights = [gait_setting(seen, name, "height") for name in ("trot", "pace", "bound")]
+    assert heights == [0.2, 0.3, 0.27]
 
 
 def test_gaits_follow_one_another_at_their_times():
@@ -260,9 +269,9 @@ def test_the_shipped_configs_load(name, repository):
 
 
 def test_what_a_gait_is_left_through_is_compiled_in_however_far_it_goes():
-    keys = {"gaits.bound.leave_through": "landing", "gaits.landing.leave_through": "walk"}
+    keys = {"gaits.bound.transition_gait": "landing", "gaits.landing.transition_gait": "walk"}
     gaits = load_config(RunConfig, None, keys).gaits
-    assert used(gaits, ["bound", "trot"]) == ["bound", "trot", "landing", "walk"]
+    assert reachable_gaits(gaits, ["bound", "trot"]) == ["bound", "trot", "landing", "walk"]
 
 
 def test_names_of_earlier_versions_say_what_has_become_of_them():

@@ -386,13 +386,13 @@ def test_gaits_are_switched_at_their_times_in_one_trace(controller):
 
 def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait():
     trot, bound, stand = build_gaits(bounding())
-    assert trot.leave_through == bound.leave_through == stand.leave_through == ""
+    assert trot.transition_gait == bound.transition_gait == stand.transition_gait == ""
     config = bounding(
-        **{"gaits.bound.leave_through": "landing", "gaits.landing.period": 0.06}
+        **{"gaits.bound.transition_gait": "landing", "gaits.landing.period": 0.06}
         | {"gaits.trot.period": 0.54, "gaits.trot.duty": [0.25 / 0.54] * 4}
     )
     *others, landing = gaits = build_gaits(config)
-    assert [g.leave_through for g in others] == ["", "landing", ""]
+    assert [g.transition_gait for g in others] == ["", "landing", ""]
     assert [(p.stance, p.duration) for p in landing.phases] == [((True,) * 4, 0.06)]
     assert [g.switch_rule for g in gaits] == ["anywhere", "first_flight", "anywhere", "cycle_end"]
     # One number for each gait, and the landing is at the trot's height.
@@ -405,7 +405,7 @@ def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait
         == 4
     )
     np.testing.assert_array_equal(tables.params.height[3], config.lmpc.height)
-    np.testing.assert_array_equal(tables.params.schedule.leave_through, [0, 3, 2, 3])
+    np.testing.assert_array_equal(tables.params.schedule.transition_gait, [0, 3, 2, 3])
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The joint loops that a real motor is sent give the torque that a simulator applies."""
+"""The PD loops that a real motor is sent give the torque that a simulator applies."""
 
 import jax
 import jax.numpy as jnp

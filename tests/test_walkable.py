@@ -35,7 +35,7 @@ def test_the_defaults_and_the_shipped_configs_are_not_complained_of(repository):
 
 def test_bounds_that_cannot_carry_the_weight_name_their_key_and_what_is_needed():
     """2 x 160 N under 83 kg: half a second of trot takes 83 x 9.81 x 0.5 = 407 N s."""
-    text = r"gaits\.trot\.force_z_max: in a cycle of trot \(0\.5 s\) the feet can give 160 N s"
+    text = r"lmpc\.force_z_max: in a cycle of trot \(0\.5 s\) the feet can give 160 N s, and 488"
     with pytest.raises(ValueError, match=text):
         check_walkable(RunConfig(), HEAVY)
     with pytest.raises(ValueError, match=text):
@@ -56,8 +56,17 @@ def test_a_gait_is_measured_by_its_own_bounds(name):
 @pytest.mark.parametrize("height", [0.05, 0.50])
 def test_a_height_that_the_legs_do_not_reach_is_refused(gait, key, height):
     keys = {"gait.names": [gait], f"{key}.height": height}
-    with pytest.raises(ValueError, match=rf"gaits\.{gait}\.height is {height} m; the legs reach"):
+    with pytest.raises(ValueError, match=rf"{key}\.height is {height} m; the legs reach"):
         check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
+
+
+def test_an_error_names_the_key_that_the_number_came_from():
+    for keys, key in (
+        ({"lmpc.force_z_max": 60.0}, "lmpc.force_z_max"),
+        ({"gaits.trot.force_z_max": 60.0}, "gaits.trot.force_z_max"),
+    ):
+        with pytest.raises(ValueError, match=rf"^{key.replace('.', chr(92) + '.')}: in a cycle"):
+            check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
 
 
 @pytest.mark.parametrize(
@@ -73,12 +82,11 @@ def test_a_height_that_the_legs_do_not_reach_is_refused(gait, key, height):
          r"bound: .* stance of RR, RL of 0\.05 s, shorter"),
         ({"gait.names": ["flying_trot"], "gaits.flying_trot.duty": [0.495] * 4},
          r"flying_trot: .* flight of 0\.003 s"),
-        ({"gaits.bound.leave_through": "landing", "gaits.landing.period": 0.002},
+        ({"gaits.bound.transition_gait": "landing", "gaits.landing.period": 0.002},
          r"landing: .* of 0\.002 s"),
         (
-            {"gait.names": ["own"], "gaits.own.horizon": "multiphase", "gaits.own.feet_front": 0.1,
-             "gaits.own.feet_rear": 0.1},
-            r"own\.horizon = 'multiphase' takes one phase in which front legs stand and one",
+            {"gait.names": ["bound_multiphase"], "gaits.bound_multiphase.duty": [0.6] * 4},
+            r"bound_multiphase\.horizon = 'multiphase' takes one phase in which front legs",
         ),
         (
             {"gait.names": ["bound_multiphase"],
@@ -190,10 +198,13 @@ def test_the_mean_force_carries_the_weight_over_a_cycle_and_turns_nothing(keys):
     chosen = load_config(RunConfig, None, keys)
     gaits = build_gaits(chosen)
     (index,) = [i for i, one in enumerate(gaits) if one.name == chosen.gait.names[0]]
-    force = np.asarray(mean_force(gaits, chosen, 12.0))[index]
+    robot = go1.PARAMS
+    force = np.asarray(mean_force(gaits, chosen, robot))[index]
     legs = np.array([np.reshape(p.stance, (2, 2)).sum(axis=1) for p in gaits[index].phases])
     impulses = np.array([p.duration for p in gaits[index].phases])[:, None] * legs * force
-    np.testing.assert_allclose(impulses.sum(), 12.0 * GRAVITY * gaits[index].period, rtol=1e-12)
+    np.testing.assert_allclose(
+        impulses.sum(), robot.mass * GRAVITY * gaits[index].period, rtol=1e-12
+    )
     own = chosen.gaits[gaits[index].name]
     levers = np.array([own.feet_front or 0.2, -(own.feet_rear or 0.2)])
     # Rounding of impulses of 60 N s at 0.2 m.
@@ -202,4 +213,4 @@ def test_the_mean_force_carries_the_weight_over_a_cycle_and_turns_nothing(keys):
 
 def test_the_papers_reference_is_no_force():
     chosen = config(lmpc__input_reference="zero")
-    np.testing.assert_array_equal(mean_force(build_gaits(chosen), chosen, 12.0), 0.0)
+    np.testing.assert_array_equal(mean_force(build_gaits(chosen), chosen, go1.PARAMS), 0.0)

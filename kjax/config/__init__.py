@@ -6,7 +6,7 @@ Every field's docstring ends with its unit in brackets; ``--help`` of the experi
 from kjax.config.checks import Tunable
 from kjax.config.control import (
     CommandConfig,
-    GaitTimesConfig,
+    GaitScheduleConfig,
     LateralConfig,
     LegConfig,
     LmpcConfig,
@@ -27,7 +27,7 @@ __all__ = [
     "FigureConfig",
     "FitStudyConfig",
     "GaitConfig",
-    "GaitTimesConfig",
+    "GaitScheduleConfig",
     "Gaits",
     "KoopmanConfig",
     "LateralConfig",

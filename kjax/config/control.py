@@ -125,7 +125,7 @@ class LmpcConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class GaitTimesConfig:
+class GaitScheduleConfig:
     """Which gait when."""
 
     names: tuple[str, ...] = ("trot",)
@@ -136,7 +136,7 @@ class GaitTimesConfig:
     """Gaits that are compiled besides, so that they may be asked for while it runs [-]."""
 
     @model_validator(mode="after")
-    def _check(self) -> "GaitTimesConfig":
+    def _check(self) -> "GaitScheduleConfig":
         require_timeline(self.times, "names", self.names)
         return self
 

@@ -45,7 +45,7 @@ class GaitConfig:
     switch_rule: Literal["anywhere", "first_flight", "cycle_end"] = "anywhere"
     """When it may be left: at once, as the first flight of its cycle begins (in a bound Raibert's
     rule: no foot is kicked into the ground that carries no weight), or at the cycle's end [-]."""
-    leave_through: str = ""
+    transition_gait: str = ""
     """Name of a gait that is walked for a cycle when this one is left, such as a landing [-]."""
     horizon: Literal["stance", "multiphase"] = "stance"
     """What the prediction covers: the present stance (the paper), or a whole cycle, flights and
@@ -86,8 +86,10 @@ class GaitConfig:
     def _check(self) -> "GaitConfig":
         if (self.feet_front is None) != (self.feet_rear is None):
             raise ValueError("feet_front and feet_rear belong together: give both or neither")
-        if self.horizon == "multiphase" and self.feet_front is None:
-            raise ValueError("horizon = 'multiphase' needs feet_front and feet_rear")
+        if self.horizon == "multiphase":
+            for key in ("feet_front", "feet_rear", "state_weights", "input_weight"):
+                if getattr(self, key) is None:  # the lmpc's weights are of a step, not per second
+                    raise ValueError(f"horizon = 'multiphase' needs {key}")
         return self
 
 
@@ -194,7 +196,7 @@ class Gaits(Mapping[str, GaitConfig]):
     def __get_pydantic_core_schema__(
         cls, source: Any, handler: GetCoreSchemaHandler
     ) -> core_schema.CoreSchema:
-        """Read from tables by name, which ``completed`` has filled up; written likewise."""
+        """Read from tables by name, which ``on_library`` has filled up; written likewise."""
         table = core_schema.dict_schema(
             core_schema.str_schema(), handler.generate_schema(GaitConfig)
         )
@@ -208,7 +210,7 @@ class Gaits(Mapping[str, GaitConfig]):
         )
 
 
-def completed(tables: Any) -> Any:
+def on_library(tables: Any) -> Any:
     """``[gaits]`` of a file, each table on top of the library's entry of that name."""
     if not isinstance(tables, Mapping):
         return tables
@@ -220,7 +222,7 @@ def completed(tables: Any) -> Any:
     }
 
 
-def setting(config: Any, name: str, key: str) -> Any:
+def gait_setting(config: Any, name: str, key: str) -> Any:
     """A gait's own value, or that of ``[lmpc]`` or ``[leg]`` where it gives none.
 
     Args:
@@ -229,17 +231,24 @@ def setting(config: Any, name: str, key: str) -> Any:
       key: of ``GaitConfig``.
     """
     own = getattr(config.gaits[name], key)
-    if own is not None:
-        return own
-    section = config.leg if key in ("apex", "velocity_gain") else config.lmpc
-    return getattr(section, key)
+    return getattr(getattr(config, _fallback(key)), key) if own is None else own
 
 
-def used(gaits: Gaits, names: Iterable[str]) -> list[str]:
+def setting_key(config: Any, name: str, key: str) -> str:
+    """The dotted key that ``gait_setting`` reads, for errors."""
+    own = getattr(config.gaits[name], key)
+    return f"{_fallback(key)}.{key}" if own is None else f"gaits.{name}.{key}"
+
+
+def _fallback(key: str) -> str:
+    return "leg" if key in ("apex", "velocity_gain") else "lmpc"
+
+
+def reachable_gaits(gaits: Gaits, names: Iterable[str]) -> list[str]:
     """Names of gaits, and of those that they are left through, each once, in order."""
     out = list(dict.fromkeys(names))
     for name in out:  # which grows on the way
-        through = gaits[name].leave_through
+        through = gaits[name].transition_gait
         if through and through not in out:
             out.append(through)
     return out

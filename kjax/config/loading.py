@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from kjax.config.checks import Tunable
-from kjax.config.gaits import LIBRARY, GaitConfig, Gaits, completed, dump_used, used
+from kjax.config.gaits import LIBRARY, GaitConfig, Gaits, dump_used, on_library, reachable_gaits
 
 T = TypeVar("T")
 
@@ -51,7 +51,7 @@ RETIRED = {
     "gait.stance_time": "has gone: set gaits.trot.period and gaits.trot.duty",
     "gait.trot_flight": "has gone: the gait flying_trot has flights (gait.names)",
     "gait.switch_rule": "is now gaits.bound.switch_rule: 'anywhere', 'first_flight', 'cycle_end'",
-    "gait.landing_time": "has gone: set gaits.bound.leave_through = 'landing' and "
+    "gait.landing_time": "has gone: set gaits.bound.transition_gait = 'landing' and "
     "gaits.landing.period",
     "command.velocities": "is now command.v_x",
     "lmpc.height_above": "is no key any more: heights are measured from the stance feet",
@@ -156,7 +156,7 @@ def load_config(
                 raise ConfigError(f"{source}: {key}: '{section}' is a value, not a section")
         node[leaf] = value
     if "gaits" in data:
-        data["gaits"] = completed(data["gaits"])
+        data["gaits"] = on_library(data["gaits"])
     try:
         # Through JSON, since strict mode then takes lists for tuples but still no "3" for 3.
         return TypeAdapter(cls).validate_json(json.dumps(data, default=str), strict=True)
@@ -220,5 +220,5 @@ def to_dict(config: Any) -> dict[str, Any]:
     """The config as nested plain data (lists for tuples), ready for TOML or JSON."""
     data: dict[str, Any] = TypeAdapter(type(config)).dump_python(config, mode="json")
     if "gaits" in data:
-        data["gaits"] = dump_used(config.gaits, used(config.gaits, config.gait.names))
+        data["gaits"] = dump_used(config.gaits, reachable_gaits(config.gaits, config.gait.names))
     return data

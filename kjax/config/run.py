@@ -6,13 +6,13 @@ from pydantic.dataclasses import dataclass
 from kjax.config.checks import STRICT, Count, Positive, require_multiple, require_name
 from kjax.config.control import (
     CommandConfig,
-    GaitTimesConfig,
+    GaitScheduleConfig,
     LateralConfig,
     LegConfig,
     LmpcConfig,
     MultiPhaseConfig,
 )
-from kjax.config.gaits import Gaits, setting
+from kjax.config.gaits import Gaits, gait_setting
 from kjax.config.model import KoopmanConfig, SrbConfig
 from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
 
@@ -33,7 +33,7 @@ class RunConfig:
     """Prediction models."""
     lmpc: LmpcConfig = LmpcConfig()
     """Model predictive control."""
-    gait: GaitTimesConfig = GaitTimesConfig()
+    gait: GaitScheduleConfig = GaitScheduleConfig()
     """Which gait when."""
     gaits: Gaits = Gaits()
     """The gaits."""
@@ -74,13 +74,13 @@ class RunConfig:
             for name in names:
                 require_name(f"gait.{key}", name, self.gaits)
         for name, one in self.gaits.items():
-            low, high = (setting(self, name, f"force_z_{end}") for end in ("min", "max"))
+            low, high = (gait_setting(self, name, f"force_z_{end}") for end in ("min", "max"))
             if not low <= high:
                 raise ValueError(
                     f"gaits.{name}: force_z_min must not exceed force_z_max, got {low} and {high}"
                 )
-            if one.leave_through:
-                require_name(f"gaits.{name}.leave_through", one.leave_through, self.gaits)
+            if one.transition_gait:
+                require_name(f"gaits.{name}.transition_gait", one.transition_gait, self.gaits)
         return self
 
 

@@ -46,7 +46,7 @@ class Gait(NamedTuple):
       ramp_cycles: over so many cycles; 0 for no ramp.
       switch_rule: when it may be left: "anywhere", as the "first_flight" of its cycle begins, or at
         the "cycle_end".
-      leave_through: name of the gait in between when this one is left; itself for none.
+      transition_gait: name of the gait in between when this one is left; itself for none.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Gait(NamedTuple):
     ramp_start: float = 1.0
     ramp_cycles: int = 0
     switch_rule: SwitchRule = "anywhere"
-    leave_through: str = ""
+    transition_gait: str = ""
 
     @property
     def period(self) -> float:
@@ -127,7 +127,7 @@ class Schedule(NamedTuple):
       stance_time: (G, P, 4) length of the leg's current or next stance [s].
       may_leave: (G, P) whether a switch to another gait may happen during the phase.
       leave_when_done: (G,) whether it waits for the phase's end.
-      leave_through: (G,) gait in between, itself for none.
+      transition_gait: (G,) gait in between, itself for none.
       ramp_start: (G,) fraction of the flights' length in the first cycle [-].
       ramp_cycles: (G,) cycles until it is 1.
     """
@@ -141,7 +141,7 @@ class Schedule(NamedTuple):
     stance_time: Float[Array, "G P 4"]
     may_leave: Bool[Array, "G P"]
     leave_when_done: Bool[Array, "G"]
-    leave_through: Int[Array, "G"]
+    transition_gait: Int[Array, "G"]
     ramp_start: Float[Array, "G"]
     ramp_cycles: Int[Array, "G"]
 
@@ -171,8 +171,8 @@ def build_schedule(gaits: list[Gait]) -> Schedule:
         for phase in gait.phases:
             if not phase.duration > 0:
                 raise ValueError(f"phase durations must be positive, got {phase.duration} s")
-        if (gait.leave_through or gait.name) not in names:
-            raise ValueError(f"leave_through names no gait here: {gait.leave_through!r}")
+        if (gait.transition_gait or gait.name) not in names:
+            raise ValueError(f"transition_gait names no gait here: {gait.transition_gait!r}")
     padded = max(len(gait.phases) for gait in gaits)
     rows = [[(g.phases, min(i, len(g.phases) - 1)) for i in range(padded)] for g in gaits]
 
@@ -192,7 +192,7 @@ def build_schedule(gaits: list[Gait]) -> Schedule:
         stance_time=table(_stance_times),
         may_leave=jnp.asarray(np.array(leave)),
         leave_when_done=jnp.asarray([gait.switch_rule != "anywhere" for gait in gaits]),
-        leave_through=jnp.asarray([names.index(g.leave_through or g.name) for g in gaits]),
+        transition_gait=jnp.asarray([names.index(g.transition_gait or g.name) for g in gaits]),
         ramp_start=jnp.asarray([gait.ramp_start for gait in gaits], float),
         ramp_cycles=jnp.asarray([gait.ramp_cycles for gait in gaits]),
     )
@@ -367,7 +367,7 @@ def advance(
         return onward
     free = schedule.may_leave[onward.gait, onward.phase]
     free = free & (done | ~schedule.leave_when_done[clock.gait])
-    through = schedule.leave_through[clock.gait]
+    through = schedule.transition_gait[clock.gait]
     target = jnp.where(through == clock.gait, wanted, through).astype(clock.gait.dtype)
     entered = start(target, jnp.zeros_like(elapsed))
     # A carried remainder is at least -dt / 2; anything below means that the gait has not begun.

@@ -50,20 +50,20 @@ class LegCommand(NamedTuple):
     foot_vel: Float[Array, "4 d"]
 
 
-class JointLoops(NamedTuple):
+class JointTargets(NamedTuple):
     """What the legs ask of the joints, each (leg, joint).
 
     Attributes:
       torque: not yet within the robot's limits [N m].
-      q: angle that a leg in the air follows [rad].
+      q: angle that a leg in the air tracks [rad].
       dq: and its rate [rad/s].
-      follows: joints that follow them; the others press.
+      tracks: joints that track them by PD control; the others press.
     """
 
     torque: Float[Array, "4 3"]
     q: Float[Array, "4 3"]
     dq: Float[Array, "4 3"]
-    follows: Bool[Array, "4 3"]
+    tracks: Bool[Array, "4 3"]
 
 
 class Footing(NamedTuple):
@@ -110,7 +110,7 @@ class Base(NamedTuple):
             LegCommand,
             Observation,
         ],
-        JointLoops,
+        JointTargets,
     ]
 
 
@@ -164,7 +164,7 @@ def _planar_joints(
     view: View,
     command: LegCommand,
     observation: Observation,
-) -> JointLoops:
+) -> JointTargets:
     """Thigh and calf press or swing; the abduction joints are held at zero."""
     body = view.planar
     angle, rate = swing.joint_reference(robot, body, command.foot, command.foot_vel)
@@ -176,11 +176,11 @@ def _planar_joints(
     )
     zero = jnp.zeros_like(abduction)[:, None]
     in_air = ~command.stance[:, None]
-    return JointLoops(
+    return JointTargets(
         torque=jnp.concatenate([abduction[:, None], sagittal], axis=-1),
         q=jnp.concatenate([zero, angle], axis=-1),
         dq=jnp.concatenate([zero, rate], axis=-1),
-        follows=jnp.concatenate([jnp.ones_like(in_air), in_air, in_air], axis=-1),
+        tracks=jnp.concatenate([jnp.ones_like(in_air), in_air, in_air], axis=-1),
     )
 
 
@@ -227,7 +227,7 @@ def _free_joints(
     view: View,
     command: LegCommand,
     observation: Observation,
-) -> JointLoops:
+) -> JointTargets:
     """All joints press with the regulated forces, or follow the path of a swing."""
     body = view.whole
     assert body is not None  # _free_view made it
@@ -240,6 +240,6 @@ def _free_joints(
     press = press * jnp.minimum(1.0, sideways.torque_fraction / jnp.maximum(load, 1e-6))
     # A sideways force has nothing to push against before the foot is down: keep the leg upright.
     loose = command.stance & ~observation.contact
-    follows = jnp.broadcast_to(~command.stance[:, None], press.shape)
-    follows = follows.at[:, 0].set(~command.stance | loose)
-    return JointLoops(jnp.where(follows, follow, press), angle, rate, follows)
+    tracks = jnp.broadcast_to(~command.stance[:, None], press.shape)
+    tracks = tracks.at[:, 0].set(~command.stance | loose)
+    return JointTargets(jnp.where(tracks, follow, press), angle, rate, tracks)

@@ -14,7 +14,7 @@ from kjax.config import (
     RunConfig,
     SimConfig,
 )
-from kjax.config.gaits import setting
+from kjax.config.gaits import gait_setting
 from kjax.legs.base import build_base
 from kjax.resolve import build_command
 from kjax.robots import go1
@@ -113,7 +113,7 @@ def reference_height(
       time: (N,) since the start [s].
       config: of the run.
     """
-    heights = [setting(config, one.name, "height") for one in build_gaits(config)]
+    heights = [gait_setting(config, one.name, "height") for one in build_gaits(config)]
     command = build_command(config.command)
     piece = np.searchsorted(command.times, time + 1e-9, side="right") - 1
     return np.array(heights)[gait] + command.values[piece, COMMAND_NAMES.index("height")]
@@ -121,7 +121,7 @@ def reference_height(
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
     """Qpos and qvel of the robot, standing, disturbed as the config and its seed say."""
-    height, joints = go1.stand_pose(setting(config, config.gait.names[0], "height"))
+    height, joints = go1.stand_pose(gait_setting(config, config.gait.names[0], "height"))
     qpos, qvel = np.zeros(15), np.zeros(15)
     qpos[1], qpos[3:] = height, joints.reshape(-1)
     spread, noise = config.noise, np.random.default_rng([config.seed, 0])

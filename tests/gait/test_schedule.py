@@ -367,7 +367,7 @@ def gaits(*, anywhere=False, landing=False, tick=TICK):
                 TICKS[::2] * tick,
                 TICKS[1::2] * tick,
                 switch_rule="anywhere" if anywhere else "first_flight",
-                leave_through="landing" if landing else "",
+                transition_gait="landing" if landing else "",
             ),
             stand(LANDING_TICKS * tick, name="landing", switch_rule="cycle_end"),
         ]
@@ -538,7 +538,7 @@ def test_switches_of_any_kind_trace_once_and_keep_the_clock_s_types(dtype):
         ([one("x", Phase(NONE, 0.1))], "leg 0 never stands"),
         ([stand(0.0)], r"durations must be positive, got 0"),
         ([stand(switch_rule="first_flight")], "stand has no flight"),
-        ([stand(), one("x", *BOUND.phases, leave_through="nowhere")], "'nowhere'"),
+        ([stand(), one("x", *BOUND.phases, transition_gait="nowhere")], "'nowhere'"),
     ],
 )
 def test_a_gait_that_cannot_be_walked_is_refused(gaits, message):

@@ -30,7 +30,7 @@ VALUES = {
         f"gaits.{gait}.{key}": value
         for gait in ("trot", "bound")
         for key, value in {
-            "leave_through": "stand",
+            "transition_gait": "stand",
             "switch_rule": "cycle_end",
             "height": 0.28,
             "state_weights": [1000.0, 2e4, 1000.0, 10.0, 2.0, 0.1],
