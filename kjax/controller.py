@@ -246,15 +246,13 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         torque = jnp.where(valid, targets.torque, held)
         torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
         tracks, damped = targets.tracks & valid, ~valid & ~recent
-        command = _joint_command(
-            torque,
-            q=jnp.where(tracks, targets.q, observation.joint_pos),
-            dq=jnp.where(tracks, targets.dq, jnp.where(damped, 0.0, joint_vel)),
-            kp=jnp.where(tracks, settings.kp, 0.0),
-            kd=jnp.where(tracks, settings.kd, jnp.where(damped, params.blind_damping, 0.0)),
-            joint_pos=observation.joint_pos,
-            joint_vel=joint_vel,
-        )
+        # PD loops of the joints, and what makes them give these torques for this sample.
+        q = jnp.where(tracks, targets.q, observation.joint_pos)
+        dq = jnp.where(tracks, targets.dq, jnp.where(damped, 0.0, joint_vel))
+        kp = jnp.where(tracks, settings.kp, 0.0)
+        kd = jnp.where(tracks, settings.kd, jnp.where(damped, params.blind_damping, 0.0))
+        pd = kp * (q - observation.joint_pos) + kd * (dq - joint_vel)
+        command = JointCommand(torque=torque, q=q, dq=dq, kp=kp, kd=kd, feedforward=torque - pd)
 
         # Step 4: the local frame moves on with the trunk.
         base_vel = jnp.where(valid, view.base_vel, state.base_vel)
@@ -328,18 +326,3 @@ def _facing(track: Array | None) -> Array | None:
     if track is None:
         return None
     return jnp.where((track == 0.0).all(), jnp.array([1.0, 0.0], track.dtype), track)
-
-
-def _joint_command(
-    torque: Array,
-    *,
-    q: Array,
-    dq: Array,
-    kp: Array,
-    kd: Array,
-    joint_pos: Array,
-    joint_vel: Array,
-) -> JointCommand:
-    """The torques, and PD loops of the joints that give them for this sample; all (4, 3)."""
-    feedforward = torque - (kp * (q - joint_pos) + kd * (dq - joint_vel))
-    return JointCommand(torque=torque, q=q, dq=dq, kp=kp, kd=kd, feedforward=feedforward)
