@@ -32,20 +32,20 @@ CASES: dict[str, dict[str, Any]] = {name: {} for name in _FILES} | {
     "trot to bound": {"gait.names": ["trot", "bound"], "gait.times": [0.0, 0.45]},
     "bound, friction as rows": {"lmpc.friction": 0.6},
 }  # fmt: skip
-LMPC = ("lmpc.state_weights", "lmpc.input_weight", "lmpc.force_x_max", "lmpc.height")
+LMPC = ("lmpc.Q", "lmpc.R", "lmpc.grf_x_max", "lmpc.body_height")
 BOUND = tuple(
-    f"gaits.bound.{key}" for key in ("state_weights", "input_weight", "feet_front", "force_edge",
-                                     "force_z_max", "velocity_gain")
+    f"gaits.bound.{key}" for key in ("Q", "R", "foothold_front", "force_edge",
+                                     "grf_z_max", "foothold_gain")
 )  # fmt: skip
 CYCLE = (
     *(f"gaits.bound_multiphase.{key}"
-      for key in ("state_weights", "input_weight", "feet_front", "velocity_gain")),
+      for key in ("Q", "R", "foothold_front", "foothold_gain")),
     "multiphase.inertia_scale", "multiphase.velocity_time",
 )  # fmt: skip
 KEYS = {
-    "trot": (*LMPC, "leg.velocity_gain"),
+    "trot": (*LMPC, "leg.foothold_gain"),
     "trot, planted model, measured feet": (
-        *LMPC, "leg.velocity_gain", "lmpc.integral_gains", "srb.mass", "srb.inertia",
+        *LMPC, "leg.foothold_gain", "lmpc.integral_gains", "srb.mass", "srb.inertia",
     ),
     "trot to bound": (*LMPC, *BOUND),
     "bound, the paper's timing": BOUND,

@@ -165,12 +165,10 @@ def weight_scales(sets: int) -> np.ndarray:
 def scaled(config: RunConfig, row: np.ndarray) -> RunConfig:
     """The config with its gait's weights times these factors."""
     name = config.gait.names[0]
-    own = config.gaits[name].state_weights is not None
+    own = config.gaits[name].Q is not None
     part: Any = config.gaits[name] if own else config.lmpc
-    weights = tuple(float(w * f) for w, f in zip(part.state_weights, row[:6], strict=True))
-    part = dataclasses.replace(
-        part, state_weights=weights, input_weight=float(part.input_weight * row[6])
-    )
+    weights = tuple(float(w * f) for w, f in zip(part.Q, row[:6], strict=True))
+    part = dataclasses.replace(part, Q=weights, R=float(part.R * row[6]))
     if own:
         return dataclasses.replace(config, gaits=Gaits({**config.gaits, name: part}))
     return dataclasses.replace(config, lmpc=part)

@@ -193,10 +193,10 @@ def _own_keys(config: RunConfig) -> tuple[str, ...]:
     own = config.gaits[name]
     keys = [
         f"gaits.{name}.{key}"
-        for key in ("state_weights", "input_weight", "velocity_gain")
+        for key in ("Q", "R", "foothold_gain")
         if getattr(own, key) is not None
     ]
-    return tuple(keys) or ("lmpc.state_weights", "lmpc.input_weight")
+    return tuple(keys) or ("lmpc.Q", "lmpc.R")
 
 
 def _settings(args: Namespace) -> list[Any]:

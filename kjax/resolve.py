@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from kjax import gait
 from kjax.config import CommandConfig, KoopmanConfig, Overlay, RunConfig
 from kjax.config.gaits import gait_setting, reachable_gaits
+from kjax.config.units import InSi, in_si
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import Point, fit_modes, stack_bodies
 from kjax.koopman.prediction import build_prediction, model_spec
@@ -109,29 +110,30 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
 
     Configs that differ elsewhere, in weights or bounds, share one fit.
     """
-    gaits = build_gaits(config)
-    problems, _ = contact_problems(gaits, config)
+    si = in_si(config, robot)
+    gaits = build_gaits(si)
+    problems, _ = contact_problems(gaits, si)
     names = [gaits[problem.gait].name for problem in problems]
-    feet = tuple(_nominal_feet(config, robot, name) for name in names)
+    feet = tuple(_nominal_feet(si, robot, name) for name in names)
     modes = tuple(problem.mode for problem in problems)
-    hover = config.koopman.model == "srb_hover"
-    heights = tuple(gait_setting(config, name, "height") if hover else 0.0 for name in names)
+    hover = si.koopman.model == "srb_hover"
+    heights = tuple(gait_setting(si, name, "body_height") if hover else 0.0 for name in names)
     # What a file holds may have changed since.
-    fit = _fit.__wrapped__ if config.koopman.file else _fit
-    mass, inertia = (float(number) for number in body_numbers(config, robot))
-    return fit(mass, inertia, config.koopman, modes, feet, heights)
+    fit = _fit.__wrapped__ if si.koopman.file else _fit
+    mass, inertia = (float(number) for number in body_numbers(si, robot))
+    return fit(mass, inertia, si.koopman, modes, feet, heights)
 
 
-def _nominal_feet(config: RunConfig, robot: RobotParams, name: str) -> tuple[Point, Point]:
+def _nominal_feet(config: InSi, robot: RobotParams, name: str) -> tuple[Point, Point]:
     """Contact points (x, z) of front and rear legs from the centre of mass, standing still [m]."""
-    own, height = config.gaits[name], gait_setting(config, name, "height")
-    if own.feet_front is None or own.feet_rear is None:
+    own, height = config.gaits[name], gait_setting(config, name, "body_height")
+    if own.foothold_front is None or own.foothold_rear is None:
         body = own_body(config.srb, robot, height)
         assert body.feet_front is not None  # own_body filled them in
         assert body.feet_rear is not None
         return body.feet_front, body.feet_rear
     sole = float(robot.foot_radius - height)
-    return (own.feet_front, sole), (-own.feet_rear, sole)
+    return (own.foothold_front, sole), (-own.foothold_rear, sole)
 
 
 @lru_cache(maxsize=32)
@@ -188,61 +190,62 @@ def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
 
 def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> ControllerParams:
     """Parameters from a config, or an ``Overlay`` with traced values, and its fits."""
-    gaits = build_gaits(config)
+    si = in_si(config, robot)
+    gaits = build_gaits(si)
     names = [one.name for one in gaits]
-    leg, sideways = config.leg, config.lateral
-    foresees = cycle_nodes(gaits, config).any(axis=1)
-    problems, index = contact_problems(gaits, config)
+    leg, sideways = si.leg, si.lateral
+    foresees = cycle_nodes(gaits, si).any(axis=1)
+    problems, index = contact_problems(gaits, si)
 
     return ControllerParams(
         robot=robot,
         fits=fits,
-        modes=problem_settings(config, problems, names, mean_force(gaits, config, robot)),
+        modes=problem_settings(si, problems, names, mean_force(gaits, si, robot)),
         problem=jnp.asarray(index),
-        uncertainty_discount=jnp.asarray(config.lmpc.caution, float),
-        friction=jnp.asarray(config.lmpc.friction, float),
-        torque_fraction=jnp.asarray(config.lmpc.torque_fraction, float),
+        uncertainty_discount=jnp.asarray(si.lmpc.caution, float),
+        friction=jnp.asarray(si.lmpc.friction, float),
+        torque_fraction=jnp.asarray(si.lmpc.torque_fraction, float),
         schedule=gait.build_schedule(gaits),
-        gait_times=jnp.asarray(config.gait.times),
-        gaits=jnp.asarray([names.index(name) for name in config.gait.names]),
-        reference=_reference_tables(gaits, config, robot),
-        multiphase=multiphase_params(gaits, config, robot),
+        gait_times=jnp.asarray(si.gait.times),
+        gaits=jnp.asarray([names.index(name) for name in si.gait.names]),
+        reference=_reference_tables(gaits, si, robot),
+        multiphase=multiphase_params(gaits, si, robot),
         swing=swing.SwingParams(
-            apex=_column(config, names, "apex"),
-            velocity_gain=_column(config, names, "velocity_gain"),
-            offset=jnp.stack([_foothold_offset(robot, config.gaits[name]) for name in names]),
+            apex=_column(si, names, "swing_height"),
+            velocity_gain=_column(si, names, "foothold_gain"),
+            offset=jnp.stack([_foothold_offset(robot, si.gaits[name]) for name in names]),
             horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
             hold_after=jnp.asarray(leg.hold_after),
             reach_speed=jnp.asarray(leg.reach_speed),
-            kp=jnp.asarray([leg.kp_abduction, leg.kp, leg.kp]),
-            kd=jnp.asarray([leg.kd_abduction, leg.kd, leg.kd]),
+            kp=jnp.asarray([leg.abduction_kp, leg.swing_kp, leg.swing_kp]),
+            kd=jnp.asarray([leg.abduction_kd, leg.swing_kd, leg.swing_kd]),
         ),
         lateral=lateral.LateralParams(
-            roll=jnp.asarray([sideways.roll_stiffness, sideways.roll_damping]),
-            yaw=jnp.asarray([sideways.yaw_stiffness, sideways.yaw_damping]),
-            damping=jnp.asarray(sideways.damping),
-            weights=jnp.asarray(sideways.wrench_weights),
+            roll=jnp.asarray([sideways.roll_kp, sideways.roll_kd]),
+            yaw=jnp.asarray([sideways.yaw_kp, sideways.yaw_kd]),
+            damping=jnp.asarray(sideways.sideways_kd),
+            weights=jnp.asarray(sideways.wrench_cost),
             ridge=jnp.asarray(sideways.force_weight),
             friction=jnp.minimum(
                 sideways.friction,
-                jnp.where(foresees, config.multiphase.friction, config.lmpc.friction),
+                jnp.where(foresees, si.multiphase.friction, si.lmpc.friction),
             ),
             torque_fraction=jnp.minimum(
                 1.0,
-                jnp.where(foresees, config.multiphase.torque_fraction, config.lmpc.torque_fraction),
+                jnp.where(foresees, si.multiphase.torque_fraction, si.lmpc.torque_fraction),
             ),
-            foothold_gain=jnp.asarray(sideways.velocity_gain),
+            foothold_gain=jnp.asarray(sideways.foothold_gain),
         ),
-        command=build_command(config.command),
-        height=_column(config, names, "height"),
-        command_slew=jnp.asarray(config.lmpc.command_slew, float),
-        height_slew=jnp.asarray(config.lmpc.height_slew, float),
+        command=build_command(si.command),
+        height=_column(si, names, "body_height"),
+        command_slew=jnp.asarray(si.lmpc.command_slew, float),
+        height_slew=jnp.asarray(si.lmpc.height_slew, float),
         integral=jnp.stack(
-            [jnp.asarray(config.lmpc.integral_gains), jnp.asarray(config.lmpc.integral_limits)]
+            [jnp.asarray(si.lmpc.integral_gains), jnp.asarray(si.lmpc.integral_limits)]
         ),
-        position_slack=jnp.asarray(config.lmpc.position_slack),
+        position_slack=jnp.asarray(si.lmpc.position_slack),
         hold_time=jnp.asarray(leg.hold_time),
-        blind_damping=jnp.asarray(leg.blind_damping),
+        blind_damping=jnp.asarray(leg.blind_kd),
     )
 
 
@@ -256,13 +259,13 @@ def build_command(command: CommandConfig) -> Command:
 _fit_modes = jax.jit(fit_modes, static_argnames=("config", "modes"))
 
 
-def _column(config: RunConfig | Overlay, names: Sequence[str], key: str) -> Array:
+def _column(config: InSi, names: Sequence[str], key: str) -> Array:
     """One setting of several gaits, stacked."""
     return jnp.stack([jnp.asarray(gait_setting(config, name, key), float) for name in names])
 
 
 def problem_settings(
-    config: RunConfig | Overlay,
+    config: InSi,
     problems: Sequence[Problem],
     names: Sequence[str],
     mean_force: Float[Array, "G 2"],
@@ -270,7 +273,7 @@ def problem_settings(
     """Weights and bounds of every problem: those of its gait.
 
     Args:
-      config: of the run, or an ``Overlay``.
+      config: of the run, in SI units.
       problems: contact modes of the gaits.
       names: of the gaits.
       mean_force: (G, 2) F_z per front and rear leg that R penalises the distance from [N].
@@ -285,12 +288,12 @@ def problem_settings(
     force = mean_force[np.array([problem.gait for problem in problems])]
     hover = jnp.stack([jnp.zeros_like(force), force], axis=-1).reshape(len(problems), 4)
     lower, upper = (
-        pair(sign * _column(config, own, "force_x_max"), _column(config, own, f"force_z_{end}"))
+        pair(sign * _column(config, own, "grf_x_max"), _column(config, own, f"grf_z_{end}"))
         for sign, end in ((-1.0, "min"), (1.0, "max"))
     )
     return ModeSettings(
-        state_weights=_column(config, own, "state_weights"),
-        input_weights=jnp.tile(_column(config, own, "input_weight")[:, None], 4),
+        state_weights=_column(config, own, "Q"),
+        input_weights=jnp.tile(_column(config, own, "R")[:, None], 4),
         lower=jnp.where(standing, lower, 0.0),
         upper=jnp.where(standing, upper, 0.0),
         input_reference=jnp.where(standing, hover, 0.0),
@@ -298,7 +301,7 @@ def problem_settings(
 
 
 def multiphase_params(
-    gaits: list[gait.Gait], config: RunConfig | Overlay, robot: RobotParams
+    gaits: list[gait.Gait], config: InSi, robot: RobotParams
 ) -> multiphase.MultiPhaseParams:
     """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
     chosen = config.multiphase
@@ -309,26 +312,24 @@ def multiphase_params(
     feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in ends]
     return multiphase.MultiPhaseParams(
         nodes=jnp.asarray(cycle_nodes(gaits, config)),
-        state_weights=_column(config, names, "state_weights"),
-        input_weight=_column(config, names, "input_weight"),
+        state_weights=_column(config, names, "Q"),
+        input_weight=_column(config, names, "R"),
         mass=jnp.asarray(mass),
         inertia=jnp.asarray(inertia * chosen.inertia_scale),
         friction=jnp.asarray(chosen.friction),
         torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
-        force_x_max=_column(config, names, "force_x_max"),
+        force_x_max=_column(config, names, "grf_x_max"),
         force_z=jnp.stack(
-            [_column(config, names, "force_z_min"), _column(config, names, "force_z_max")], axis=-1
+            [_column(config, names, "grf_z_min"), _column(config, names, "grf_z_max")], axis=-1
         ),
         feet=jnp.stack(feet),
-        velocity_gain=_column(config, names, "velocity_gain"),
+        velocity_gain=_column(config, names, "foothold_gain"),
         velocity_time=jnp.asarray(chosen.velocity_time),
         height_time=jnp.asarray(chosen.height_time),
     )
 
 
-def _reference_tables(
-    gaits: list[gait.Gait], config: RunConfig | Overlay, robot: RobotParams
-) -> Array:
+def _reference_tables(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> Array:
     """Periodic motion of every gait at every ramp level; zero where the reference is constant."""
     mass, inertia = body_numbers(config, robot)
     levels = 1 + max(g.ramp_cycles for g in gaits)
@@ -355,7 +356,7 @@ def _reference_tables(
 
 def _foothold_offset(robot: RobotParams, own: Any) -> Array:
     """Foothold of a gait ahead of the hip, standing still, for each leg [m]."""
-    if own.feet_front is None:
+    if own.foothold_front is None:
         return jnp.zeros(4)
-    wanted = [own.feet_front] * 2 + [-own.feet_rear] * 2
+    wanted = [own.foothold_front] * 2 + [-own.foothold_rear] * 2
     return jnp.stack([jnp.asarray(one, float) for one in wanted]) - robot.hip_pos[:, 0]

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kjax.config import GaitConfig, Overlay, RunConfig, SrbConfig
+from kjax.config import Overlay, RunConfig, SrbConfig
+from kjax.config.units import InSi
 from kjax.gait import Gait
 from kjax.legs import kinematics
 from kjax.observation import standing
@@ -62,7 +63,7 @@ def _standing_com(robot: RobotParams, height: float) -> tuple[Array, Array]:
     return jax.lax.fori_loop(0, 20, again, jnp.zeros(2)), hips
 
 
-def body_numbers(config: RunConfig | Overlay, robot: RobotParams) -> tuple[Any, Any]:
+def body_numbers(config: RunConfig | Overlay | InSi, robot: RobotParams) -> tuple[Any, Any]:
     """Mass [kg] and pitch inertia [kg m^2] of the prediction; may be traced."""
     srb = config.srb
     return (
@@ -71,19 +72,17 @@ def body_numbers(config: RunConfig | Overlay, robot: RobotParams) -> tuple[Any, 
     )
 
 
-def levers(own: GaitConfig | Overlay, robot: RobotParams) -> tuple[Any, Any]:
+def levers(own: InSi, robot: RobotParams) -> tuple[Any, Any]:
     """Distances of a gait's front and rear footholds from the centre of mass, standing still [m].
 
     Below the hips both count as the hips' mean, so that the ends share the weight alike.
     """
-    if own.feet_front is None or own.feet_rear is None:
+    if own.foothold_front is None or own.foothold_rear is None:
         return (jnp.abs(robot.hip_pos[:, 0]).mean(),) * 2
-    return own.feet_front, own.feet_rear
+    return own.foothold_front, own.foothold_rear
 
 
-def mean_force(
-    gaits: list[Gait], config: RunConfig | Overlay, robot: RobotParams
-) -> Float[Array, "G 2"]:
+def mean_force(gaits: list[Gait], config: InSi, robot: RobotParams) -> Float[Array, "G 2"]:
     """Vertical force of one front and one rear leg of each gait, mean of its stance [N].
 
     Over a cycle the legs carry the weight and leave no net turn:

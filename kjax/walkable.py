@@ -9,6 +9,7 @@ from kjax import gait
 from kjax.command import check_command
 from kjax.config import Overlay, RunConfig
 from kjax.config.gaits import gait_setting, reachable_gaits, setting_key
+from kjax.config.units import InSi, in_si
 from kjax.gait.reference import has_periodic_reference
 from kjax.legs.kinematics import REACH
 from kjax.rigid_body import nominal_feet, own_body
@@ -31,7 +32,7 @@ class Problem(NamedTuple):
     mode: Mode
 
 
-def build_gaits(config: RunConfig | Overlay) -> list[gait.Gait]:
+def build_gaits(config: RunConfig | Overlay | InSi) -> list[gait.Gait]:
     """The gaits that a config compiles, in the order of their indices.
 
     Those of ``gait.also`` first, then those of ``gait.names``, then those that these are left
@@ -53,7 +54,7 @@ def build_gaits(config: RunConfig | Overlay) -> list[gait.Gait]:
 
 
 def contact_problems(
-    gaits: list[gait.Gait], config: RunConfig | Overlay
+    gaits: list[gait.Gait], config: RunConfig | Overlay | InSi
 ) -> tuple[list[Problem], np.ndarray]:
     """The problems of all gaits, and (G, P) which of them each phase poses.
 
@@ -72,7 +73,7 @@ def contact_problems(
     return problems, index
 
 
-def cycle_nodes(gaits: list[gait.Gait], config: RunConfig | Overlay) -> np.ndarray:
+def cycle_nodes(gaits: list[gait.Gait], config: RunConfig | Overlay | InSi) -> np.ndarray:
     """Number of nodes (G, P) of each phase; zero for gaits that predict within a stance only."""
     nodes = np.zeros((len(gaits), max(len(g.phases) for g in gaits)), int)
     for index, one in enumerate(gaits):
@@ -101,8 +102,8 @@ def check_walkable(config: RunConfig, robot: RobotParams) -> None:
     for one in build_gaits(config):
         _check_timing(config, one)
         if one.name in walked:
-            _check_reach(config, robot, one.name)
-            _check_weight(config, robot, one)
+            _check_reach(in_si(config, robot), robot, one.name)
+            _check_weight(in_si(config, robot), robot, one)
 
 
 def _check_timing(config: RunConfig, one: gait.Gait) -> None:
@@ -187,14 +188,14 @@ def _check_contact_points(config: RunConfig, robot: RobotParams) -> None:
         )
 
 
-def _check_weight(config: RunConfig, robot: RobotParams, one: gait.Gait) -> None:
+def _check_weight(config: InSi, robot: RobotParams, one: gait.Gait) -> None:
     """Refuse bounds of the forces that cannot carry the weight, or give more than it."""
     own = config.gaits[one.name]
     section = "multiphase" if own.horizon == "multiphase" else "lmpc"
     weight = float(robot.mass) * GRAVITY * one.period
     needed = MARGIN * weight
     standing = sum(phase.duration * sum(phase.stance) for phase in one.phases)
-    bounds = ("force_z_max", "force_z_min")
+    bounds = ("grf_z_max", "grf_z_min")
     keys = [setting_key(config, one.name, bound) for bound in bounds]
     given, least = (standing * gait_setting(config, one.name, bound) for bound in bounds)
     fraction = getattr(config, section).torque_fraction
@@ -220,7 +221,7 @@ def _check_weight(config: RunConfig, robot: RobotParams, one: gait.Gait) -> None
         )
 
 
-def _calf_force(config: RunConfig, robot: RobotParams, name: str) -> float:
+def _calf_force(config: InSi, robot: RobotParams, name: str) -> float:
     """Vertical force at which the calf's torque limit is reached, foot below the hip [N]."""
     thigh, calf = float(robot.thigh_length), float(robot.calf_length)
     drop = _drop(config, robot, name)
@@ -230,23 +231,27 @@ def _calf_force(config: RunConfig, robot: RobotParams, name: str) -> float:
     return float(np.min(robot.torque_limit[..., 2]) / lever)
 
 
-def _drop(config: RunConfig, robot: RobotParams, name: str) -> float:
+def _drop(config: InSi, robot: RobotParams, name: str) -> float:
     """Depth of the foot centre below the hip at the reference height [m]."""
-    height = float(gait_setting(config, name, "height"))
+    height = float(gait_setting(config, name, "body_height"))
     return height - float(robot.foot_radius) + float(robot.hip_pos[:, 2].mean())
 
 
-def _check_reach(config: RunConfig, robot: RobotParams, name: str) -> None:
-    height = gait_setting(config, name, "height")
+def _check_reach(config: InSi, robot: RobotParams, name: str) -> None:
+    height = gait_setting(config, name, "body_height")
     low, high = np.array(REACH) * float(robot.thigh_length + robot.calf_length)
     drop = _drop(config, robot, name)
     asked = (0.0, *config.command.height)
     if not (low < drop + min(asked) and drop + max(asked) < high):
-        key = f"{setting_key(config, name, 'height')} is {height:g} m"
+        length = float(robot.thigh_length + robot.calf_length)
+        key = (
+            f"{setting_key(config, name, 'body_height')} is {height / length:.4g} leg lengths, "
+            f"{height:.4g} m,"
+        )
         if any(asked):
-            key += f" and command.height {min(asked):+g} to {max(asked):+g} m"
+            key += f" and command.height {min(asked):+g} to {max(asked):+g} m,"
         raise ValueError(
-            f"{key}; the legs reach {low:.3g} to {high:.3g} m below the "
-            f"hips, so that it must be about {low + height - drop:.2f} to "
-            f"{high + height - drop:.2f} m"
+            f"{key} but the legs reach {low:.3g} to {high:.3g} m below the hips, so that it must "
+            f"be about {(low + height - drop) / length:.2f} to "
+            f"{(high + height - drop) / length:.2f} leg lengths"
         )

@@ -23,7 +23,7 @@ from kjax.robots import go1  # noqa: E402
 from kjax.tuning import loop, optimise, space  # noqa: E402
 
 config = load_config(RunConfig, "configs/bound_velocity_short.toml", {"duration": 1.2})
-keys = ["gaits.bound.state_weights", "gaits.bound.input_weight", "gaits.bound.velocity_gain"]
+keys = ["gaits.bound.Q", "gaits.bound.R", "gaits.bound.foothold_gain"]
 numbers = space.build_space(config, keys)
 print({key: np.round(value, 3) for key, value in numbers.overrides(numbers.start).items()})
 
@@ -62,7 +62,7 @@ def slopes_along(direction, memory):
 
 
 damping = jax.tree.map(np.zeros_like, numbers.start)
-damping["gaits.bound.state_weights"][3:] = 1.0  # the three velocities' weights together
+damping["gaits.bound.Q"][3:] = 1.0  # the three velocities' weights together
 slopes = slopes_along(damping, float("inf"))
 print("bad weights, true derivatives:", [f"{slope:.0e}" for slope in slopes])
 

@@ -26,9 +26,9 @@ def refusal(capsys, *words):
 
 def test_any_key_can_be_overridden_by_its_dotted_name():
     config, _ = parse(
-        "--lmpc.horizon", "9", "--gaits.bound.switch_rule=anywhere", "--lmpc.force_z_min", "-5.0"
+        "--lmpc.horizon", "9", "--gaits.bound.switch_rule=anywhere", "--lmpc.grf_z_min", "-0.05"
     )
-    assert (config.lmpc.horizon, config.lmpc.force_z_min) == (9, -5.0)
+    assert (config.lmpc.horizon, config.lmpc.grf_z_min) == (9, -0.05)
     assert config.gaits.bound.switch_rule == "anywhere"
 
 

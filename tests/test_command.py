@@ -53,7 +53,10 @@ def test_what_the_planar_controller_does_not_follow_is_refused_at_the_edge(name)
 @pytest.mark.parametrize("height", [-0.2, 0.2])
 def test_a_height_that_the_legs_do_not_reach_is_refused(height):
     config = load_config(RunConfig, None, {"command.height": [0.0, height, 0.0, 0.0, 0.0]})
-    with pytest.raises(ValueError, match=r"lmpc\.height is 0\.27 m and command\.height .* m; the"):
+    with pytest.raises(
+        ValueError,
+        match=r"body_height is 0\.6338 leg lengths, 0\.27 m, and command\.height .* m, but",
+    ):
         resolve(config, go1.PARAMS)
 
 
@@ -82,7 +85,7 @@ def test_the_height_follows_the_command_at_its_rate(resolved):
         state, info = plan(tables, state, observation)
         heights.append(float(info.reference[1]))
     # 0.2 m/s for 5 ms at a time, then it is there.
-    wanted = 0.27 - 0.001 * np.minimum(np.arange(1, 7), 4)
+    wanted = 0.426 * 0.6338 - 0.001 * np.minimum(np.arange(1, 7), 4)
     np.testing.assert_allclose(heights, wanted, atol=1e-12)
 
 

@@ -63,34 +63,42 @@ def message(overrides, cls=RunConfig, path=None):
         ({"gaits.trot.perod": 0.4}, ("gaits.trot.perod", "did you mean 'gaits.trot.period'")),
         ({"gaits.trot.duty": [0.5, 0.5, 0.5, 1.2]}, ("gaits.trot.duty", "1.2", "or equal to 1")),
         ({"gaits.trot.offset": [0.0, 1.0, 0.0, 0.0]}, ("gaits.trot.offset", "1.0", "less than 1")),
-        ({"gaits.trot.feet_front": 0.1}, ("gaits.trot", "feet_front and feet_rear belong")),
-        ({"gaits.trot.horizon": "multiphase"}, ("gaits.trot", "needs feet_front")),
+        (
+            {"gaits.trot.foothold_front": 0.2347},
+            ("gaits.trot", "foothold_front and foothold_rear belong"),
+        ),
+        ({"gaits.trot.horizon": "multiphase"}, ("gaits.trot", "needs foothold_front")),
         (
             {
                 "gaits.own.horizon": "multiphase",
-                "gaits.own.feet_front": 0.1,
-                "gaits.own.feet_rear": 0.1,
+                "gaits.own.foothold_front": 0.2347,
+                "gaits.own.foothold_rear": 0.2347,
             },
-            ("gaits.own", "needs state_weights"),
+            ("gaits.own", "needs Q"),
         ),
         ({"gaits.bound.transition_gait": "land"}, ("gaits.bound.transition_gait", "'landing'")),
         ({"gait.also": ["walkk"]}, ("gait.also", "'walkk'", "did you mean 'walk'")),
         ({"gaits.own.period": "a"}, ("gaits.own.period", "got 'a'")),
         # Keys of earlier versions
-        ({"bound.height": 0.3}, ("bound.height", "is now gaits.bound.height")),
+        ({"bound.height": 0.3}, ("bound.height", "is now gaits.bound.body_height")),
         ({"bound.front_stance": 0.1}, ("bound.front_stance", "period, offset and duty")),
         ({"bound.horizon": "multiphase"}, ("bound.horizon", "bound_multiphase")),
         (
             {"multiphase.force_x_max": 80.0},
-            ("multiphase.force_x_max", "is now gaits.bound_multiphase.force_x_max"),
+            ("multiphase.force_x_max", "is now gaits.bound_multiphase.grf_x_max"),
         ),
+        # Keys of earlier versions in SI units
+        ({"lmpc.state_weights": [1.0] * 6}, ("lmpc.state_weights", "is now lmpc.Q", "1 / (L^2,")),
+        ({"gaits.own.apex": 0.1}, ("gaits.own.apex", "is now gaits.own.swing_height", "of L (")),
+        ({"lateral.roll_damping": 4.0}, ("is now lateral.roll_kd", "m g L sqrt(L / g)")),
+        ({"leg.kp": 100.0}, ("leg.kp", "is now leg.swing_kp", "m g L / rad")),
         ({"gait.stance_time": 0.2}, ("gait.stance_time", "gaits.trot.period")),
         ({"gait.trot_flight": 0.05}, ("gait.trot_flight", "flying_trot")),
         ({"gait.switch_rule": "anywhere"}, ("gait.switch_rule", "gaits.bound.switch_rule")),
         ({"gait.landing_time": 0.1}, ("gait.landing_time", "transition_gait = 'landing'")),
         ({"gaits.bound.reference": "none"}, ("gaits.bound.reference", "got 'none'")),
-        ({"gaits.bound.force_z_min": 400.0}, ("bound", "force_z_min", "400.0", "300.0")),
-        ({"gaits.bound.force_z_max": 10.0}, ("bound", "force_z_min", "20.0", "10.0")),
+        ({"gaits.bound.grf_z_min": 3.2}, ("bound", "grf_z_min", "3.2", "2.4")),
+        ({"gaits.bound.grf_z_max": 0.08}, ("bound", "grf_z_min", "0.16", "0.08")),
         ({"gaits.bound.ramp_start": 0.0}, ("gaits.bound.ramp_start", "got 0.0", "greater than 0")),
         (
             {"gaits.bound.ramp_start": 1.5},
@@ -99,13 +107,13 @@ def message(overrides, cls=RunConfig, path=None):
         ({"gaits.bound.ramp_cycles": -1}, ("gaits.bound.ramp_cycles", "got -1")),
         ({"duration": 0.004}, ("duration", "0.004", "lmpc.control_dt 0.005")),
         ({"duration": 0.0}, ("duration", "got 0.0", "greater than 0")),
-        ({"lmpc.force_z_min": 200.0}, ("lmpc", "force_z_min", "200.0", "160.0")),
+        ({"lmpc.grf_z_min": 1.6}, ("lmpc", "grf_z_min", "1.6", "1.28")),
         ({"lmpc.model_dt": 0.0015}, ("lmpc.model_dt", "multiple", "0.0015")),
         ({"lmpc.control_dt": 0.0004}, ("lmpc.control_dt", "multiple", "0.0004")),
         ({"lmpc.command_slew": 0.0}, ("lmpc.command_slew", "greater than 0")),
         ({"command.times": [0.0, 1.0]}, ("command", "equally long", "2", "5")),
         ({"command.times": [0, 3, 2, 4, 5]}, ("command", "increase")),
-        ({"lmpc.state_weights": [1.0, 2.0]}, ("lmpc.state_weights", "[1.0, 2.0]")),
+        ({"lmpc.Q": [1.0, 2.0]}, ("lmpc.Q", "[1.0, 2.0]")),
         ({"seed": True}, ("seed", "True", "integer")),
         ({"seed.x": 1}, ("seed",)),
     ],
@@ -189,7 +197,7 @@ def test_overrides_win_over_the_file(tmp_path):
 
 
 def test_a_config_survives_the_way_through_plain_data():
-    config = load_config(RunConfig, None, {"lmpc.force_z_max": float("inf"), "seed": 7})
+    config = load_config(RunConfig, None, {"lmpc.grf_z_max": float("inf"), "seed": 7})
     again = load_config(RunConfig, None, to_dict(config))
     assert again == config
 
@@ -201,16 +209,20 @@ def test_building_a_config_in_python_checks_it_too():
         SrbConfig(mass=-3.0)
     with pytest.raises(ValueError, match="force_z"):
         DatasetConfig(force_z=(10.0, 0.0))
-    with pytest.raises(ValueError, match="force_z_min must not exceed force_z_max"):
-        RunConfig(gaits=Gaits({"trot": GaitConfig(force_z_min=30.0, force_z_max=20.0)}))
+    with pytest.raises(ValueError, match="grf_z_min must not exceed grf_z_max"):
+        RunConfig(gaits=Gaits({"trot": GaitConfig(grf_z_min=0.3, grf_z_max=0.2)}))
     with pytest.raises(ValueError, match="times must increase"):
         GaitScheduleConfig(names=("trot", "bound", "trot"), times=(0.0, 1.0, 1.0))
 
 
 def test_a_gait_of_a_config_changes_the_librarys_or_is_its_own():
-    keys = {"gaits.bound.apex": 0.1, "gaits.gallop.offset": [0.0, 0.1, 0.5, 0.6], "seed": 3}
+    keys = {
+        "gaits.bound.swing_height": 0.24,
+        "gaits.gallop.offset": [0.0, 0.1, 0.5, 0.6],
+        "seed": 3,
+    }
     config = load_config(RunConfig, None, keys)
-    assert config.gaits.bound == dataclasses.replace(LIBRARY["bound"], apex=0.1)
+    assert config.gaits.bound == dataclasses.replace(LIBRARY["bound"], swing_height=0.24)
     assert config.gaits["gallop"] == GaitConfig(offset=(0.0, 0.1, 0.5, 0.6))
     assert config.gaits.trot == LIBRARY["trot"]
     assert set(config.gaits) == {*LIBRARY, "gallop"}
@@ -222,18 +234,18 @@ def test_a_gait_of_a_config_changes_the_librarys_or_is_its_own():
     assert load_config(RunConfig, None, data) == config
     assert hash(load_config(RunConfig, None, data)) == hash(config)
     assert dataclasses.replace(config, seed=4).gaits is config.gaits
-    assert config != load_config(RunConfig, None, keys | {"gaits.bound.apex": 0.11})
+    assert config != load_config(RunConfig, None, keys | {"gaits.bound.swing_height": 0.2582})
 
 
 def test_what_a_gait_does_not_give_is_the_lmpcs_or_the_legs():
-    keys = {"lmpc.height": 0.25, "leg.apex": 0.08, "gaits.pace.height": 0.26}
+    keys = {"lmpc.body_height": 0.6, "leg.swing_height": 0.2, "gaits.pace.body_height": 0.61}
     config = load_config(RunConfig, None, keys)
-    found = {name: gait_setting(config, name, "height") for name in ("trot", "pace", "bound")}
-    assert found == {"trot": 0.25, "pace": 0.26, "bound": 0.27}
-    assert gait_setting(config, "pronk", "apex") == 0.08
-    seen = Overlay(config, {"gaits.pace.height": 0.3, "lmpc.height": 0.2})
-    heights = [gait_setting(seen, name, "height") for name in ("trot", "pace", "bound")]
-    assert heights == [0.2, 0.3, 0.27]
+    found = {name: gait_setting(config, name, "body_height") for name in ("trot", "pace", "bound")}
+    assert found == {"trot": 0.6, "pace": 0.61, "bound": 0.6338}
+    assert gait_setting(config, "pronk", "swing_height") == 0.2
+    seen = Overlay(config, {"gaits.pace.body_height": 0.7, "lmpc.body_height": 0.5})
+    heights = [gait_setting(seen, name, "body_height") for name in ("trot", "pace", "bound")]
+    assert heights == [0.5, 0.7, 0.6338]
 
 
 def test_gaits_follow_one_another_at_their_times():
@@ -245,9 +257,9 @@ def test_gaits_follow_one_another_at_their_times():
 
 
 def test_the_bound_s_force_limits_may_be_switched_off():
-    infinite = {"force_x_max": float("inf"), "force_z_max": float("inf")}
+    infinite = {"grf_x_max": float("inf"), "grf_z_max": float("inf")}
     config = load_config(RunConfig, None, {f"gaits.bound.{key}": v for key, v in infinite.items()})
-    assert config.gaits.bound.force_x_max == config.gaits.bound.force_z_max == float("inf")
+    assert config.gaits.bound.grf_x_max == config.gaits.bound.grf_z_max == float("inf")
 
 
 @pytest.mark.parametrize("cls", [RunConfig, FitStudyConfig])

@@ -11,6 +11,7 @@ import pytest
 
 from kjax import Observation, RunConfig, build_controller, load_config, qp
 from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, LmpcConfig
+from kjax.config.gaits import LIBRARY
 from kjax.koopman import families, prediction, storage
 from kjax.legs.base import build_base
 from kjax.mpc.lmpc import solve_lmpc
@@ -21,7 +22,12 @@ from kjax.robots import go1
 from kjax.types import Leg, Mode
 from kjax.walkable import build_gaits, contact_problems
 
-HIP_X, COM_X = 0.1881, -0.00208199  # m
+HIP_X, COM_X = 0.1881, -0.00208202  # m
+# Footholds of the bound [m], of leg lengths; stiffness of swing legs [N m/rad], of m g L.
+FRONT, REAR = 0.426 * LIBRARY["bound"].foothold_front, 0.426 * LIBRARY["bound"].foothold_rear
+HEIGHT = 0.426 * 0.6338  # m
+WEIGHT = float(go1.PARAMS.mass) * 9.81  # N
+STIFFNESS = 2.817 * float(go1.PARAMS.mass) * 9.81 * 0.426
 CONFIG = load_config(RunConfig, None, {"sim.base": "planar"})
 STANCE = {
     Mode.TROT: [True, False, False, True],  # the first diagonal
@@ -32,7 +38,7 @@ STANCE = {
 }
 
 
-def standing(dtype=float, com_height=0.27, **changes):
+def standing(dtype=float, com_height=HEIGHT, **changes):
     height, joints = go1.stand_pose(com_height)
     floats = {
         "base_pos": [0.0, 0.0, height],
@@ -108,7 +114,7 @@ def test_swing_legs_get_no_force_and_stance_legs_carry_about_the_weight(controll
 
 def test_a_lower_body_asks_for_more_force_and_a_slow_one_for_a_push(controller, tables, plan):
     base = np.asarray(after_first_plan(controller, tables, plan)[0].force).sum(axis=0)
-    low = standing(com_height=0.265)
+    low = standing(com_height=HEIGHT - 0.005)
     assert np.asarray(after_first_plan(controller, tables, plan, low)[0].force).sum(axis=0)[2] > (
         base[2] + 5.0
     )
@@ -295,14 +301,15 @@ def box():
 @pytest.mark.parametrize(
     ("mode", "least", "most", "sideways"),
     [
-        (Mode.TROT, 0.0, 160.0, 60.0),
-        (Mode.FRONT, 20.0, 300.0, 51.5),
-        (Mode.REAR, 20.0, 300.0, 51.5),
-        (Mode.STAND, 0.0, 160.0, 60.0),
+        (Mode.TROT, 0.0, 1.28, 0.48),
+        (Mode.FRONT, 0.16, 2.4, 0.412),
+        (Mode.REAR, 0.16, 2.4, 0.412),
+        (Mode.STAND, 0.0, 1.28, 0.48),
     ],
 )
 def test_each_mode_presses_within_its_own_limits_and_reaches_them(box, mode, least, most, sideways):
     controller, plan, bound_tables = box
+    least, most, sideways = WEIGHT * np.array([least, most, sideways])
     index = {Mode.TROT: 0, Mode.FRONT: 1, Mode.REAR: 1, Mode.STAND: 2}[mode]
     tables = with_params(bound_tables, gaits=jnp.asarray([index], jnp.int32))
     for name, limit in (("least", least), ("most", most)):
@@ -335,7 +342,7 @@ def test_a_bound_s_reference_is_the_body_s_own_motion_at_the_clock_s_place(
         rows += [[np.interp(t + 0.001, at, column) for column in table[phase].T] for t in inside]
     expected = np.tile(rows, (2, 1))
     # One model step ahead; the clock's place in the phase is rounded, rates of up to 100/s^2.
-    np.testing.assert_allclose(infos.reference[:, 1], 0.27 + expected[:, 0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(infos.reference[:, 1], HEIGHT + expected[:, 0], rtol=0, atol=1e-10)
     np.testing.assert_allclose(infos.reference[:, 2], expected[:, 1], rtol=0, atol=1e-10)
     np.testing.assert_allclose(infos.reference[:, 4:], expected[:, 2:], rtol=0, atol=1e-10)
     assert np.ptp(expected[:, 1]) > 0.05
@@ -355,7 +362,7 @@ def test_a_constant_reference_is_level_and_at_rest_in_every_phase(controller, pl
     tables = condense(*resolve(bounding(**{"gaits.bound.reference": "constant"}), go1.PARAMS))
     _, infos = plans(controller, tables, plan, 70)
     assert infos.mode.tolist() == CYCLE
-    level = np.tile([0.27, 0.0, 0.0, 0.0, 0.0], (70, 1))
+    level = np.tile([HEIGHT, 0.0, 0.0, 0.0, 0.0], (70, 1))
     np.testing.assert_array_equal(infos.reference[:, 1:], level)
 
 
@@ -404,7 +411,7 @@ def test_a_landing_time_puts_a_four_leg_stance_between_a_bound_and_the_next_gait
         == len(tables.params.reference)
         == 4
     )
-    np.testing.assert_array_equal(tables.params.height[3], config.lmpc.height)
+    np.testing.assert_array_equal(tables.params.height[3], tables.params.height[0])
     np.testing.assert_array_equal(tables.params.schedule.transition_gait, [0, 3, 2, 3])
 
 
@@ -450,8 +457,8 @@ def test_heights_are_measured_from_the_stance_feet_wherever_zero_is(controller, 
     _, infos = plans(controller, tables, plan, 30, high)
     assert set(infos.mode.tolist()) == {Mode.FRONT, Mode.FLIGHT}
     # Rounding of the legs' kinematics.
-    np.testing.assert_allclose(infos.reference[:, 1], 0.27, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(infos.x[:, 1], 0.27, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(infos.reference[:, 1], HEIGHT, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(infos.x[:, 1], HEIGHT, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(infos.x[:, 0], 0.0)
 
 
@@ -461,21 +468,24 @@ def test_footholds_of_a_bound_lie_closer_under_the_body(controller, bound_tables
     hips = np.asarray(go1.PARAMS.hip_pos)[:, 0]
     np.testing.assert_array_equal(offset[[0, 2]], 0.0)
     # Rounding of a sum.
-    np.testing.assert_allclose(hips + offset[1], [0.075, 0.075, -0.148, -0.148], rtol=1e-15)
-    np.testing.assert_array_equal(bound_tables.params.swing.apex, [0.06, 0.064, 0.06])
-    np.testing.assert_array_equal(bound_tables.params.swing.velocity_gain, [0.03, 0.075, 0.03])
+    np.testing.assert_allclose(hips + offset[1], [FRONT, FRONT, -REAR, -REAR], rtol=1e-14)
+    swing, bound = bound_tables.params.swing, LIBRARY["bound"]
+    heights = 0.426 * np.array([0.1408, bound.swing_height, 0.1408])
+    gains = (0.426 / 9.81) ** 0.5 * np.array([0.144, bound.foothold_gain, 0.144])
+    np.testing.assert_allclose(swing.apex, heights, rtol=1e-14)
+    np.testing.assert_allclose(swing.velocity_gain, gains, rtol=1e-14)
 
 
 def test_the_model_of_a_bound_stands_where_its_feet_do(bound_tables):
-    """Two legs 0.075 m ahead or 0.148 m behind; the other modes stand at the rigid body's feet."""
+    """Two legs ahead or behind as far; the other modes stand at the rigid body's feet."""
     B = (
         float(go1.PARAMS.pitch_inertia) / 1e-3 * np.asarray(bound_tables.params.fits.model.B)[:, 6]
     )  # moment per force
     modes = [mode for _, mode in contact_problems(build_gaits(bounding()), bounding())[0]]
     assert sorted(modes) == sorted([Mode.TROT, Mode.FRONT, Mode.FLIGHT, Mode.REAR, Mode.STAND])
     ahead = {
-        Mode.FRONT: [2 * 0.075, 0.0],
-        Mode.REAR: [0.0, -2 * 0.148],
+        Mode.FRONT: [2 * FRONT, 0.0],
+        Mode.REAR: [0.0, -2 * REAR],
         # The hips, and with them the feet, from MuJoCo's centre of mass in the nominal stance.
         Mode.TROT: [HIP_X - COM_X, -HIP_X - COM_X],
         Mode.STAND: [2 * (HIP_X - COM_X), 2 * (-HIP_X - COM_X)],
@@ -484,9 +494,9 @@ def test_the_model_of_a_bound_stands_where_its_feet_do(bound_tables):
         # The pitch rate is linear in the forces: the fit is exact but for rounding; MuJoCo's figure
         # is given to 1e-8.
         np.testing.assert_allclose(B[modes.index(mode), 1::2], arms, rtol=0, atol=3e-8)
-    # Below the centre of mass lies, at 0.27 m, the sole, and a radius higher the foot's centre.
+    # Below the centre of mass lies the sole, and a radius higher the foot's centre.
     for mode, column in ((Mode.FRONT, 0), (Mode.REAR, 2)):
-        assert 0.27 - go1.FOOT_RADIUS - 1e-9 <= B[modes.index(mode), column] / 2 <= 0.27 + 1e-9
+        assert -1e-9 <= HEIGHT - B[modes.index(mode), column] / 2 <= go1.FOOT_RADIUS + 1e-9
 
 
 def test_a_bound_s_feet_swing_to_their_own_footholds(controller, bound_tables, plan, act):
@@ -500,12 +510,12 @@ def test_a_bound_s_feet_swing_to_their_own_footholds(controller, bound_tables, p
     swing = state.swing._replace(elapsed=jnp.full(4, 0.25), duration=jnp.full(4, 0.25))
     _, joints = act(bound_tables, state._replace(swing=swing), observation)
     torque = joints.torque
-    feet = np.asarray(observation.base_pos)[0] + np.array([0.075, 0.075, -0.148, -0.148])
+    feet = np.asarray(observation.base_pos)[0] + np.array([FRONT, FRONT, -REAR, -REAR])
     expected = []
     for leg in Leg:
         local = np.array([feet[leg], go1.FOOT_RADIUS]) - [0.0, float(observation.base_pos[2])]
         angles = knee_backward(local - np.asarray(go1.PARAMS.hip_pos)[leg, ::2])
-        expected.append(150.0 * (angles - np.asarray(observation.joint_pos)[leg, 1:]))
+        expected.append(STIFFNESS * (angles - np.asarray(observation.joint_pos)[leg, 1:]))
     limit = np.asarray(go1.PARAMS.torque_limit)[1:]
     # Stiffness times the rounding of angles of order one.
     np.testing.assert_allclose(torque[:, 1:], np.clip(expected, -limit, limit), atol=1e-9)

@@ -248,7 +248,7 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
 def test_a_config_that_needs_another_simulation_is_refused(config, simulation):
     with pytest.raises(ValueError, match="simulation_key"):
         simulate(simulation, dataclasses.replace(config, leg=dataclasses.replace(
-            config.leg, apex=0.1)))  # fmt: skip
+            config.leg, swing_height=0.2)))  # fmt: skip
 
 
 PARENT = """

@@ -51,8 +51,11 @@ def test_the_loops_give_the_torque_for_the_sample_that_they_were_made_from(base)
         assert (np.abs(torque) <= go1.PARAMS.torque_limit).all()
         # Legs in the air follow angles with the configured gains, legs that stand press.
         leg = config.leg
-        np.testing.assert_array_equal(kp[~standing], [[leg.kp_abduction, leg.kp, leg.kp]] * 2)
-        np.testing.assert_array_equal(kd[~standing], [[leg.kd_abduction, leg.kd, leg.kd]] * 2)
+        moment = float(go1.PARAMS.mass) * 9.81 * 0.426  # m g L
+        stiffness = moment * np.array([leg.abduction_kp, leg.swing_kp, leg.swing_kp])
+        damping = moment * (0.426 / 9.81) ** 0.5 * np.array([leg.abduction_kd, *[leg.swing_kd] * 2])
+        np.testing.assert_allclose(kp[~standing], np.tile(stiffness, (2, 1)), rtol=1e-14)
+        np.testing.assert_allclose(kd[~standing], np.tile(damping, (2, 1)), rtol=1e-14)
         np.testing.assert_array_equal([kp[standing, 1:], kd[standing, 1:]], 0.0)
         free = np.abs(torque) < np.asarray(go1.PARAMS.torque_limit) - 1e-9
         np.testing.assert_allclose(feedforward[~standing][free[~standing]], 0.0, atol=1e-12)

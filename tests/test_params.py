@@ -84,3 +84,42 @@ def test_what_belongs_elsewhere_is_named(both):
         build_controller(RunConfig())
     with pytest.raises(TypeError, match=r"params: wanted those of kjax\.resolve, got RunConfig"):
         condense(spec, RunConfig())
+
+
+def scaled(robot, scale):
+    """The robot with all lengths times ``scale``, of the same density."""
+    powers = {"mass": 3, "trunk_mass": 3, "link_mass": 3, "pitch_inertia": 5, "torque_limit": 4}
+    return robot._replace(
+        **{name: leaf * scale ** powers.get(name, 1) for name, leaf in robot._asdict().items()}
+    )
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.6])
+def test_a_robot_scaled_in_size_and_mass_gets_params_scaled_by_dimensional_analysis(scale):
+    """Lengths by s, masses by s^3, and with g the same, times by sqrt(s)."""
+    base = resolve(RunConfig(), go1.PARAMS)[1]
+    large = resolve(RunConfig(), scaled(go1.PARAMS, scale))[1]
+    force, length, time = scale**3, scale, scale**0.5
+    for get, factor in (
+        (lambda p: p.modes.upper, force),
+        (lambda p: p.modes.input_reference, force),
+        (lambda p: p.modes.input_weights, force**-2),
+        (
+            lambda p: p.modes.state_weights,
+            np.array([length**-2] * 2 + [1.0] + [time**2 / length**2] * 2 + [time**2]),
+        ),
+        (lambda p: p.height, length),
+        (lambda p: p.swing.apex, length),
+        (lambda p: p.swing.offset, length),
+        (lambda p: p.swing.velocity_gain, time),
+        (lambda p: p.swing.kp, force * length),
+        (lambda p: p.swing.kd, force * length * time),
+        (lambda p: p.blind_damping, force * length * time),
+        (lambda p: p.lateral.roll, np.array([force * length, force * length * time])),
+        (lambda p: p.lateral.yaw, np.array([force * length, force * length * time])),
+        (lambda p: p.lateral.damping, force * time / length),
+        (lambda p: p.lateral.weights, np.array([1.0] * 3 + [length**-2] * 3)),
+        (lambda p: p.lateral.foothold_gain, time),
+        (lambda p: p.fits.feet, length),
+    ):
+        np.testing.assert_allclose(get(large), get(base) * factor, rtol=1e-6, atol=1e-9)

@@ -7,6 +7,7 @@ import pytest
 
 from kjax import load_config
 from kjax.config import ConfigError, RunConfig
+from kjax.config.units import in_si
 from kjax.resolve import resolve
 from kjax.rigid_body import mean_force
 from kjax.robots import go1
@@ -18,6 +19,7 @@ HEAVY = go1.PARAMS._replace(
     trunk_mass=np.asarray(83.0 - float(4 * go1.PARAMS.link_mass.sum())),
     torque_limit=7.0 * go1.PARAMS.torque_limit,
 )
+WEIGHT = float(go1.PARAMS.mass) * GRAVITY  # N
 
 
 def config(**keys):
@@ -35,35 +37,39 @@ def test_the_defaults_and_the_shipped_configs_are_not_complained_of(repository):
 
 def test_bounds_that_cannot_carry_the_weight_name_their_key_and_what_is_needed():
     """2 x 160 N under 83 kg: half a second of trot takes 83 x 9.81 x 0.5 = 407 N s."""
-    text = r"lmpc\.force_z_max: in a cycle of trot \(0\.5 s\) the feet can give 160 N s, and 488"
+    text = r"lmpc\.grf_z_max: in a cycle of trot \(0\.5 s\) the feet can give 160 N s, and 488"
+    weak = config(lmpc__grf_z_max=160.0 / (83.0 * GRAVITY))
     with pytest.raises(ValueError, match=text):
-        check_walkable(RunConfig(), HEAVY)
+        check_walkable(weak, HEAVY)
     with pytest.raises(ValueError, match=text):
-        resolve(RunConfig(), HEAVY)
-    check_walkable(config(lmpc__force_z_max=500.0), HEAVY)
+        resolve(weak, HEAVY)
+    # The defaults are in weights of the robot.
+    check_walkable(RunConfig(), HEAVY)
 
 
 @pytest.mark.parametrize("name", ["bound", "bound_multiphase"])
 def test_a_gait_is_measured_by_its_own_bounds(name):
     """0.35 s of 12.74 kg, 1.2 times: 52.5 N s out of 0.15 s of two feet: 175 N."""
-    keys, key = {"gait.names": [name]}, f"gaits.{name}.force_z_max"
+    keys, key = {"gait.names": [name]}, f"gaits.{name}.grf_z_max"
     with pytest.raises(ValueError, match=rf"{key}: in a cycle of {name} \(0\.35 s\)"):
-        check_walkable(load_config(RunConfig, None, keys | {key: 174.0}), go1.PARAMS)
-    check_walkable(load_config(RunConfig, None, keys | {key: 176.0}), go1.PARAMS)
+        check_walkable(load_config(RunConfig, None, keys | {key: 174.0 / WEIGHT}), go1.PARAMS)
+    check_walkable(load_config(RunConfig, None, keys | {key: 176.0 / WEIGHT}), go1.PARAMS)
 
 
 @pytest.mark.parametrize(("gait", "key"), [("trot", "lmpc"), ("bound", "gaits.bound")])
 @pytest.mark.parametrize("height", [0.05, 0.50])
 def test_a_height_that_the_legs_do_not_reach_is_refused(gait, key, height):
-    keys = {"gait.names": [gait], f"{key}.height": height}
-    with pytest.raises(ValueError, match=rf"{key}\.height is {height} m; the legs reach"):
+    keys = {"gait.names": [gait], f"{key}.body_height": height / 0.426}
+    with pytest.raises(
+        ValueError, match=rf"{key}\.body_height is .* leg lengths, {height:g} m, but the legs"
+    ):
         check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
 
 
 def test_an_error_names_the_key_that_the_number_came_from():
     for keys, key in (
-        ({"lmpc.force_z_max": 60.0}, "lmpc.force_z_max"),
-        ({"gaits.trot.force_z_max": 60.0}, "gaits.trot.force_z_max"),
+        ({"lmpc.grf_z_max": 0.48}, "lmpc.grf_z_max"),
+        ({"gaits.trot.grf_z_max": 0.48}, "gaits.trot.grf_z_max"),
     ):
         with pytest.raises(ValueError, match=rf"^{key.replace('.', chr(92) + '.')}: in a cycle"):
             check_walkable(load_config(RunConfig, None, keys), go1.PARAMS)
@@ -125,13 +131,13 @@ def test_another_mass_than_the_robots_is_warned_of_and_a_wrong_one_refused():
     [
         # Two feet of at least 80 N over all of a trot are more than 125 N of weight; 12.74 kg.
         (
-            "gaits.trot.force_z_min",
-            80.0,
-            50.0,
+            "gaits.trot.grf_z_min",
+            80.0 / WEIGHT,
+            50.0 / WEIGHT,
             r"trot \(0\.5 s\) the feet give at least 80 N s",
         ),
         # Over 0.35 s of a bound the weight is 43.7 N s, in 0.15 s of two feet: 146 N each.
-        ("gaits.bound_multiphase.force_z_min", 146.0, 100.0, "bound"),
+        ("gaits.bound_multiphase.grf_z_min", 146.0 / WEIGHT, 100.0 / WEIGHT, "bound"),
         # A calf of 0.213 m under a hip at 0.27 m: 35.55 N m hold about 230 N on one leg.
         ("lmpc.torque_fraction", 0.3, 0.4, "trot"),
         ("multiphase.torque_fraction", 0.3, 0.9, "bound"),
@@ -188,7 +194,7 @@ def test_contact_points_that_no_foot_can_have_are_refused(key, point, text):
         {},
         {"gait.names": ["flying_trot"]},
         {"gait.names": ["bound"]},
-        {"gait.names": ["bound"], "gaits.bound.feet_front": 0.10, "gaits.bound.period": 0.4},
+        {"gait.names": ["bound"], "gaits.bound.foothold_front": 0.23, "gaits.bound.period": 0.4},
         {"gait.names": ["pronk"]},
         {"gait.names": ["walk"]},
         {"gait.names": ["pace"]},
@@ -199,18 +205,20 @@ def test_the_mean_force_carries_the_weight_over_a_cycle_and_turns_nothing(keys):
     gaits = build_gaits(chosen)
     (index,) = [i for i, one in enumerate(gaits) if one.name == chosen.gait.names[0]]
     robot = go1.PARAMS
-    force = np.asarray(mean_force(gaits, chosen, robot))[index]
+    force = np.asarray(mean_force(gaits, in_si(chosen, robot), robot))[index]
     legs = np.array([np.reshape(p.stance, (2, 2)).sum(axis=1) for p in gaits[index].phases])
     impulses = np.array([p.duration for p in gaits[index].phases])[:, None] * legs * force
     np.testing.assert_allclose(
         impulses.sum(), robot.mass * GRAVITY * gaits[index].period, rtol=1e-12
     )
     own = chosen.gaits[gaits[index].name]
-    levers = np.array([own.feet_front or 0.2, -(own.feet_rear or 0.2)])
+    levers = np.array([own.foothold_front or 0.5, -(own.foothold_rear or 0.5)])
     # Rounding of impulses of 60 N s at 0.2 m.
     assert abs((impulses.sum(axis=0) * levers).sum()) < 1e-11
 
 
 def test_the_papers_reference_is_no_force():
     chosen = config(lmpc__input_reference="zero")
-    np.testing.assert_array_equal(mean_force(build_gaits(chosen), chosen, go1.PARAMS), 0.0)
+    np.testing.assert_array_equal(
+        mean_force(build_gaits(chosen), in_si(chosen, go1.PARAMS), go1.PARAMS), 0.0
+    )

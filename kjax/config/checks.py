@@ -37,13 +37,42 @@ class Tunable:
     high: float = inf
 
 
-WEIGHT = Tunable(low=1e-12)
-FORCE = Tunable(low=1.0, high=1000.0)
-MIN_FORCE = Tunable(unit=10.0, low=-100.0, high=100.0)
-HEIGHT = Tunable(low=0.15, high=0.33)
-GAIN = Tunable(unit=0.02, high=0.5)
+@dataclass(frozen=True, kw_only=True)
+class Unit:
+    """The unit of a key that scales with the robot, see ``kjax.config.units``.
+
+    Attributes:
+      text: as an error says it.
+      powers: of weight m g, leg length L and time sqrt(L / g), one entry for each component.
+    """
+
+    text: str
+    powers: tuple[tuple[int, int, int], ...]
+
+
+FORCE = Unit(text="m g", powers=((1, 0, 0),))
+LENGTH = Unit(text="L", powers=((0, 1, 0),))
+DURATION = Unit(text="sqrt(L / g)", powers=((0, 0, 1),))
+STIFFNESS = Unit(text="m g L / rad", powers=((1, 1, 0),))
+DAMPING = Unit(text="m g L sqrt(L / g) / rad", powers=((1, 1, 1),))
+LINEAR_DAMPING = Unit(text="m g / sqrt(g L)", powers=((1, -1, 1),))
+STATE_COST = Unit(
+    text="1 / (L^2, L^2, rad^2, g L, g L, g / L)",
+    powers=((0, -2, 0), (0, -2, 0), (0, 0, 0), (0, -2, 2), (0, -2, 2), (0, 0, 2)),
+)
+INPUT_COST = Unit(text="1 / (m g)^2", powers=((-2, 0, 0),))
+WRENCH_COST = Unit(
+    text="1 for forces and 1 / L^2 for moments", powers=((0, 0, 0),) * 3 + ((0, -2, 0),) * 3
+)
+
+Six = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
+COST = Tunable(low=1e-12)
+GRF = Tunable(low=0.01, high=8.0)
+MIN_GRF = Tunable(unit=0.08, low=-0.8, high=0.8)
+HEIGHT = Tunable(low=0.35, high=0.775)
+GAIN = Tunable(unit=0.1, high=2.4)
 RATE = Tunable(unit=0.5, high=20.0)
-FOOT_DISTANCE = Tunable(low=0.02, high=0.30)
+FOOT_DISTANCE = Tunable(low=0.05, high=0.7)
 TIME = Tunable(low=0.02, high=2.0)
 
 
@@ -71,10 +100,9 @@ def require_multiple(name: str, value: float, base_name: str, base: float) -> No
 
 def require_order(config: Any) -> None:
     """Refuse bounds of F_z that leave nothing between them."""
-    if not config.force_z_min <= config.force_z_max:
+    if not config.grf_z_min <= config.grf_z_max:
         raise ValueError(
-            f"force_z_min must not exceed force_z_max, got {config.force_z_min} and "
-            f"{config.force_z_max}"
+            f"grf_z_min must not exceed grf_z_max, got {config.grf_z_min} and {config.grf_z_max}"
         )
 
 

@@ -7,19 +7,29 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from kjax.config.checks import (
+    COST,
+    DAMPING,
+    DURATION,
     FORCE,
     GAIN,
+    GRF,
     HEIGHT,
-    MIN_FORCE,
+    INPUT_COST,
+    LENGTH,
+    LINEAR_DAMPING,
+    MIN_GRF,
     RATE,
+    STATE_COST,
+    STIFFNESS,
     STRICT,
     TIME,
-    WEIGHT,
+    WRENCH_COST,
     Bound,
     Count,
     Friction,
     NonNegative,
     Positive,
+    Six,
     TorqueFraction,
     Tunable,
     require_fraction,
@@ -70,23 +80,22 @@ class LmpcConfig:
     """Step of the prediction model, a multiple of koopman.dataset.dt [s]."""
     horizon: Count = 6
     """Length of the prediction, in steps of model_dt [-]."""
-    state_weights: Annotated[
-        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative], WEIGHT
-    ] = (2000.0, 3e4, 1200.0, 12.0, 3.0, 0.2)
-    """Q of (p_x, p_z, theta, v_x, v_z, omega) [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
-    input_weight: Annotated[Positive, WEIGHT] = 1e-5
-    """R of every force [1/N^2]."""
+    Q: Annotated[Six, COST, STATE_COST] = (363.0, 5444.0, 1200.0, 50.15, 12.54, 4.606)
+    """Weights of the squared errors of (p_x, p_z, theta, v_x, v_z, omega) [1/L^2, 1/L^2, 1/rad^2,
+    1/(g L), 1/(g L), L/g]."""
+    R: Annotated[Positive, COST, INPUT_COST] = 0.1563
+    """Weight of every squared force [1/(m g)^2]."""
     input_reference: Literal["mean", "zero"] = "mean"
     """What R penalises the distance from: the gait's mean force, which carries the weight, or no
     force (the paper), which leaves a droop [-]."""
-    force_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), FORCE] = 60.0
-    """Bound of |F_x| per leg, body frame [N]."""
-    force_z_min: Annotated[Bound, MIN_FORCE] = 0.0
-    """Lower bound of F_z per leg, body frame [N]."""
-    force_z_max: Annotated[Bound, FORCE] = 160.0
-    """Upper bound of F_z per leg, body frame [N]."""
-    height: Annotated[Positive, HEIGHT] = 0.27
-    """Reference height of the centre of mass above the ground under the stance feet [m]."""
+    grf_x_max: Annotated[float, Field(ge=0, allow_inf_nan=True), GRF, FORCE] = 0.48
+    """Bound of |F_x| per leg, body frame [m g]."""
+    grf_z_min: Annotated[Bound, MIN_GRF, FORCE] = 0.0
+    """Lower bound of F_z per leg, body frame [m g]."""
+    grf_z_max: Annotated[Bound, GRF, FORCE] = 1.28
+    """Upper bound of F_z per leg, body frame [m g]."""
+    body_height: Annotated[Positive, HEIGHT, LENGTH] = 0.6338
+    """Reference height of the centre of mass above the ground under the stance feet [L]."""
     command_slew: Annotated[float, Field(gt=0, allow_inf_nan=True)] = 4.0
     """Largest rate at which the reference velocity follows the command; inf for none [m/s^2]."""
     height_slew: Positive = 0.2
@@ -171,50 +180,50 @@ class LegConfig:
     """Time between two calls of act: control_dt is a multiple of it, it is one of sim_dt [s]."""
     hold_time: NonNegative = 0.02
     """How long the last torque holds when no valid sample comes [s]."""
-    blind_damping: NonNegative = 2.0
-    """Joint damping that takes its place after that [N m s/rad]."""
-    apex: Positive = 0.06
-    """Height of the swing above the higher of lift-off and target [m]."""
+    blind_kd: Annotated[NonNegative, DAMPING] = 0.18
+    """Joint damping that takes its place after that [m g L sqrt(L/g)/rad]."""
+    swing_height: Annotated[Positive, LENGTH] = 0.1408
+    """Height of the swing's apex above the higher of lift-off and target [L]."""
     horizontal_fraction: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Part of the swing after which the foot has arrived above its foothold [-]."""
-    velocity_gain: Annotated[NonNegative, GAIN] = 0.03
-    """Raibert gain on the velocity error in the foothold [s]."""
+    foothold_gain: Annotated[NonNegative, GAIN, DURATION] = 0.144
+    """Raibert gain on the velocity error in the foothold [sqrt(L/g)]."""
     reach_speed: NonNegative = 1.0
     """Speed at which a foot feels for the ground when a change of gait has cut its swing short;
     0: its leg presses at once [m/s]."""
     hold_after: Annotated[float, Field(ge=0, le=1)] = 0.3
     """Part of the swing after which a contact is an obstacle and the foot is held [-]."""
-    kp: NonNegative = 150.0
-    """Stiffness of thigh and calf joint in swing [N m/rad]."""
-    kd: NonNegative = 3.0
-    """Damping of thigh and calf joint in swing [N m s/rad]."""
-    kp_abduction: NonNegative = 200.0
-    """Stiffness of the abduction joint: in swing, or always on the planar base [N m/rad]."""
-    kd_abduction: NonNegative = 4.0
-    """Damping of the abduction joint, likewise [N m s/rad]."""
+    swing_kp: Annotated[NonNegative, STIFFNESS] = 2.817
+    """Proportional gain of thigh and calf joint in swing [m g L/rad]."""
+    swing_kd: Annotated[NonNegative, DAMPING] = 0.2703
+    """Derivative gain of thigh and calf joint in swing [m g L sqrt(L/g)/rad]."""
+    abduction_kp: Annotated[NonNegative, STIFFNESS] = 3.755
+    """Proportional gain of the abduction joint: in swing, or always on the planar base
+    [m g L/rad]."""
+    abduction_kd: Annotated[NonNegative, DAMPING] = 0.3604
+    """Its derivative gain, likewise [m g L sqrt(L/g)/rad]."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LateralConfig:
     """Regulator of roll, yaw and sideways motion; for sim.base = "free" only."""
 
-    roll_stiffness: NonNegative = 60.0
-    """Roll moment per roll [N m/rad]."""
-    roll_damping: NonNegative = 4.0
-    """Roll moment per roll rate [N m s/rad]."""
-    yaw_stiffness: NonNegative = 20.0
-    """Yaw moment per yaw away from the heading at the start [N m/rad]."""
-    yaw_damping: NonNegative = 3.0
-    """Yaw moment per yaw rate [N m s/rad]."""
-    damping: NonNegative = 30.0
-    """Sideways force per sideways velocity of the centre of mass [N s/m]."""
-    wrench_weights: tuple[
-        NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
-    ] = (1.0, 0.3, 1.0, 20.0, 20.0, 10.0)
-    """Weights of the wrench (force x, y, z, moment x, y, z) [1/N^2, 1/(N m)^2]."""
+    roll_kp: Annotated[NonNegative, STIFFNESS] = 1.127
+    """Roll moment per roll [m g L/rad]."""
+    roll_kd: Annotated[NonNegative, DAMPING] = 0.3604
+    """Roll moment per roll rate [m g L sqrt(L/g)/rad]."""
+    yaw_kp: Annotated[NonNegative, STIFFNESS] = 0.3755
+    """Yaw moment per yaw away from the heading at the start [m g L/rad]."""
+    yaw_kd: Annotated[NonNegative, DAMPING] = 0.2703
+    """Yaw moment per yaw rate [m g L sqrt(L/g)/rad]."""
+    sideways_kd: Annotated[NonNegative, LINEAR_DAMPING] = 0.4906
+    """Sideways force per sideways velocity of the centre of mass [m g/sqrt(g L)]."""
+    wrench_cost: Annotated[Six, WRENCH_COST] = (1.0, 0.3, 1.0, 3.63, 3.63, 1.815)
+    """Relative weights of the squared errors of the wrench (force x, y, z, moment x, y, z over L)
+    [-]."""
     force_weight: Positive = 1e-3
-    """Weight of a change of the planned foot forces [1/N^2]."""
+    """Weight of a squared change of the planned foot forces beside them [-]."""
     friction: NonNegative = 0.6
     """Horizontal over vertical force of a foot, at most; the LMPC's own where that is less [-]."""
-    velocity_gain: NonNegative = 0.05
-    """Sideways foothold per sideways velocity, beyond Raibert's law [s]."""
+    foothold_gain: Annotated[NonNegative, DURATION] = 0.24
+    """Sideways foothold per sideways velocity, beyond Raibert's law [sqrt(L/g)]."""

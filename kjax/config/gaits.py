@@ -12,15 +12,20 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import core_schema
 
 from kjax.config.checks import (
+    COST,
+    DURATION,
     FOOT_DISTANCE,
     FORCE,
     GAIN,
+    GRF,
     HEIGHT,
-    MIN_FORCE,
+    INPUT_COST,
+    LENGTH,
+    MIN_GRF,
+    STATE_COST,
     STRICT,
-    WEIGHT,
-    NonNegative,
     Positive,
+    Six,
     Tunable,
 )
 
@@ -54,40 +59,42 @@ class GaitConfig:
     """Reference of height and pitch: constant (the paper), or the cycle's own motion [-]."""
     force_edge: Annotated[float, Field(gt=0, le=0.5), Tunable(low=0.02, high=0.5)] = 0.25
     """Part of a stance in which the periodic reference's force rises, and again falls [-]."""
-    height: Annotated[float | None, Field(gt=0), HEIGHT] = None
-    """Reference height of the centre of mass above the ground, mean of the stances; lmpc.height if
-    not given [m]."""
-    state_weights: Annotated[
-        tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative] | None,
-        WEIGHT,
-    ] = None
-    """Q of (p_x, p_z, theta, v_x, v_z, omega), of a step, or with a multi-phase horizon per second;
-    the lmpc's if not given [1/m^2, 1/rad^2, s^2/m^2, s^2/rad^2]."""
-    input_weight: Annotated[float | None, Field(gt=0), WEIGHT] = None
-    """R of every force, likewise [1/N^2]."""
-    force_x_max: Annotated[float | None, Field(ge=0, allow_inf_nan=True), FORCE] = None
+    body_height: Annotated[float | None, Field(gt=0), HEIGHT, LENGTH] = None
+    """Reference height of the centre of mass above the ground, mean of the stances;
+    lmpc.body_height if not given [L]."""
+    Q: Annotated[Six | None, COST, STATE_COST] = None
+    """Weights of the squared errors of (p_x, p_z, theta, v_x, v_z, omega), of a step, or with a
+    multi-phase horizon per second; the lmpc's if not given [1/L^2, 1/L^2, 1/rad^2, 1/(g L),
+    1/(g L), L/g]."""
+    R: Annotated[float | None, Field(gt=0), COST, INPUT_COST] = None
+    """Weight of every squared force, likewise [1/(m g)^2]."""
+    grf_x_max: Annotated[float | None, Field(ge=0, allow_inf_nan=True), GRF, FORCE] = None
     """Bound of |F_x| per leg, body frame; world frame with a multi-phase horizon; the lmpc's if not
-    given [N]."""
-    force_z_min: Annotated[float | None, Field(allow_inf_nan=True), MIN_FORCE] = None
-    """Lower bound of F_z per leg, likewise [N]."""
-    force_z_max: Annotated[float | None, Field(allow_inf_nan=True), FORCE] = None
-    """Upper bound of F_z per leg, likewise [N]."""
-    feet_front: Annotated[float | None, Field(gt=0), FOOT_DISTANCE] = None
+    given [m g]."""
+    grf_z_min: Annotated[float | None, Field(allow_inf_nan=True), MIN_GRF, FORCE] = None
+    """Lower bound of F_z per leg, likewise [m g]."""
+    grf_z_max: Annotated[float | None, Field(allow_inf_nan=True), GRF, FORCE] = None
+    """Upper bound of F_z per leg, likewise [m g]."""
+    foothold_front: Annotated[float | None, Field(gt=0), FOOT_DISTANCE, LENGTH] = None
     """Distance of the front footholds ahead of the centre of mass, standing still; below the hips
-    if not given [m]."""
-    feet_rear: Annotated[float | None, Field(gt=0), FOOT_DISTANCE] = None
-    """Distance of the rear footholds behind the centre of mass, likewise [m]."""
-    velocity_gain: Annotated[float | None, Field(ge=0), GAIN] = None
-    """Raibert gain on the velocity error in the foothold; leg.velocity_gain if not given [s]."""
-    apex: Annotated[float | None, Field(gt=0)] = None
-    """Height of the swing above the higher of lift-off and target; leg.apex if not given [m]."""
+    if not given [L]."""
+    foothold_rear: Annotated[float | None, Field(gt=0), FOOT_DISTANCE, LENGTH] = None
+    """Distance of the rear footholds behind the centre of mass, likewise [L]."""
+    foothold_gain: Annotated[float | None, Field(ge=0), GAIN, DURATION] = None
+    """Raibert gain on the velocity error in the foothold; leg.foothold_gain if not given
+    [sqrt(L/g)]."""
+    swing_height: Annotated[float | None, Field(gt=0), LENGTH] = None
+    """Height of the swing's apex above the higher of lift-off and target; leg.swing_height if not
+    given [L]."""
 
     @model_validator(mode="after")
     def _check(self) -> "GaitConfig":
-        if (self.feet_front is None) != (self.feet_rear is None):
-            raise ValueError("feet_front and feet_rear belong together: give both or neither")
+        if (self.foothold_front is None) != (self.foothold_rear is None):
+            raise ValueError(
+                "foothold_front and foothold_rear belong together: give both or neither"
+            )
         if self.horizon == "multiphase":
-            for key in ("feet_front", "feet_rear", "state_weights", "input_weight"):
+            for key in ("foothold_front", "foothold_rear", "Q", "R"):
                 if getattr(self, key) is None:  # the lmpc's weights are of a step, not per second
                     raise ValueError(f"horizon = 'multiphase' needs {key}")
         return self
@@ -101,16 +108,16 @@ _BOUND: dict[str, Any] = {
     "ramp_cycles": 10,
     "switch_rule": "first_flight",
     "reference": "periodic",
-    "height": 0.27,
-    "state_weights": (1084.0, 1211.0, 60.0, 3.06, 3.05, 0.1),
-    "input_weight": 5.7e-7,
-    "force_x_max": 51.5,
-    "force_z_min": 20.0,  # a foot that carries no weight slips
-    "force_z_max": 300.0,
-    "feet_front": 0.075,
-    "feet_rear": 0.148,
-    "velocity_gain": 0.075,
-    "apex": 0.064,
+    "body_height": 0.6338,
+    "Q": (196.7, 219.8, 60.0, 12.79, 12.75, 2.303),
+    "R": 0.008908,
+    "grf_x_max": 0.412,
+    "grf_z_min": 0.16,  # a foot that carries no weight slips
+    "grf_z_max": 2.4,
+    "foothold_front": 0.1761,
+    "foothold_rear": 0.3474,
+    "foothold_gain": 0.3599,
+    "swing_height": 0.1502,
 }
 
 LIBRARY: dict[str, GaitConfig] = {
@@ -121,16 +128,16 @@ LIBRARY: dict[str, GaitConfig] = {
         **_BOUND
         | {
             "horizon": "multiphase",
-            "state_weights": (63.6, 190.0, 10.4, 29.0, 1.57, 0.22),
-            "input_weight": 5.26e-5,
-            "force_x_max": 90.0,
-            "force_z_min": 10.0,
-            "force_z_max": 340.0,
-            "feet_front": 0.0471,
-            "feet_rear": 0.1853,
-            "height": 0.301,
-            "velocity_gain": 0.0875,
-            "apex": 0.07,
+            "Q": (11.54, 34.48, 10.4, 121.2, 6.561, 5.066),
+            "R": 0.822,
+            "grf_x_max": 0.7199,
+            "grf_z_min": 0.07999,
+            "grf_z_max": 2.72,
+            "foothold_front": 0.1106,
+            "foothold_rear": 0.435,
+            "body_height": 0.7066,
+            "foothold_gain": 0.4199,
+            "swing_height": 0.1643,
         }
     ),
     "stand": GaitConfig(period=1.0, duty=(1.0,) * 4),
@@ -241,7 +248,7 @@ def setting_key(config: Any, name: str, key: str) -> str:
 
 
 def _fallback(key: str) -> str:
-    return "leg" if key in ("apex", "velocity_gain") else "lmpc"
+    return "leg" if key in ("swing_height", "foothold_gain") else "lmpc"
 
 
 def reachable_gaits(gaits: Gaits, names: Iterable[str]) -> list[str]:

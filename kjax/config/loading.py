@@ -11,43 +11,84 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
-from kjax.config.checks import Tunable
+from kjax.config.checks import Tunable, Unit
+from kjax.config.control import LateralConfig, LegConfig, LmpcConfig
 from kjax.config.gaits import LIBRARY, GaitConfig, Gaits, dump_used, on_library, reachable_gaits
 
 T = TypeVar("T")
 
 
+# Keys of earlier versions in SI units, and what they are now; of [gaits.NAME] as of [lmpc].
+_RESCALED = {
+    "state_weights": "Q",
+    "input_weight": "R",
+    "force_x_max": "grf_x_max",
+    "force_z_min": "grf_z_min",
+    "force_z_max": "grf_z_max",
+    "height": "body_height",
+}
+_RESCALED_GAIT = _RESCALED | {
+    "feet_front": "foothold_front",
+    "feet_rear": "foothold_rear",
+    "velocity_gain": "foothold_gain",
+    "apex": "swing_height",
+}
+_RESCALED_LEG = {
+    "apex": "swing_height",
+    "velocity_gain": "foothold_gain",
+    "kp": "swing_kp",
+    "kd": "swing_kd",
+    "kp_abduction": "abduction_kp",
+    "kd_abduction": "abduction_kd",
+    "blind_damping": "blind_kd",
+}
+_RESCALED_LATERAL = {
+    "roll_stiffness": "roll_kp",
+    "roll_damping": "roll_kd",
+    "yaw_stiffness": "yaw_kp",
+    "yaw_damping": "yaw_kd",
+    "damping": "sideways_kd",
+    "wrench_weights": "wrench_cost",
+    "velocity_gain": "foothold_gain",
+}
+
+
+def _rescaled(cls: type, new: str, section: str) -> str:
+    """What to say of a key that is now in units that scale with the robot."""
+    info = cls.__pydantic_fields__[new]  # type: ignore[attr-defined]
+    unit = next(mark for mark in info.metadata if isinstance(mark, Unit))
+    return (
+        f"is now {section}.{new}, in units of {unit.text} (m g: the robot's weight, L: its leg "
+        "length)"
+    )
+
+
+def _all_rescaled(cls: type, names: Mapping[str, str], old: str, new: str) -> dict[str, str]:
+    return {f"{old}.{key}": _rescaled(cls, name, new) for key, name in names.items()}
+
+
 # What has become of keys of earlier versions.
 _BOUND = "is now [gaits.bound] (or gaits.bound_multiphase, which predicts through flight)"
 RETIRED = {
+    **_all_rescaled(LmpcConfig, _RESCALED, "lmpc", "lmpc"),
+    **_all_rescaled(LegConfig, _RESCALED_LEG, "leg", "leg"),
+    **_all_rescaled(LateralConfig, _RESCALED_LATERAL, "lateral", "lateral"),
+    **_all_rescaled(GaitConfig, _RESCALED_GAIT, "bound", "gaits.bound"),
+    **_all_rescaled(
+        GaitConfig,
+        {key: name for key, name in _RESCALED.items() if key != "height"},
+        "multiphase",
+        "gaits.bound_multiphase",
+    ),
     **{
         f"bound.{key}": f"{_BOUND}: set its period, offset and duty"
         for key in ("front_stance", "first_flight", "rear_stance", "second_flight")
     },
     **{
         f"bound.{key}": f"is now gaits.bound.{key}"
-        for key in (
-            "ramp_start",
-            "ramp_cycles",
-            "feet_front",
-            "feet_rear",
-            "reference",
-            "force_edge",
-            "height",
-            "state_weights",
-            "input_weight",
-            "force_x_max",
-            "force_z_min",
-            "force_z_max",
-            "velocity_gain",
-            "apex",
-        )
+        for key in ("ramp_start", "ramp_cycles", "reference", "force_edge")
     },
     "bound.horizon": "has gone: the gait bound_multiphase predicts through flight (gait.names)",
-    **{
-        f"multiphase.{key}": f"is now gaits.bound_multiphase.{key}"
-        for key in ("state_weights", "input_weight", "force_x_max", "force_z_min", "force_z_max")
-    },
     "gait.stance_time": "has gone: set gaits.trot.period and gaits.trot.duty",
     "gait.trot_flight": "has gone: the gait flying_trot has flights (gait.names)",
     "gait.switch_rule": "is now gaits.bound.switch_rule: 'anywhere', 'first_flight', 'cycle_end'",
@@ -178,6 +219,9 @@ def _explain(error: ValidationError, cls: type) -> str:
     if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         if key in RETIRED:
             return f"{key}: {RETIRED[key]}"
+        if loc[0] == "gaits" and loc[-1] in _RESCALED_GAIT:
+            section = ".".join(loc[:-1])
+            return f"{key}: {_rescaled(GaitConfig, _RESCALED_GAIT[loc[-1]], section)}"
         inner = [old for old in RETIRED if old.startswith(f"{key}.")]
         if inner and isinstance(came, Mapping):  # a section that has gone
             old = next((o for o in inner if o.split(".", 1)[1] in came), inner[0])

@@ -74,10 +74,10 @@ class RunConfig:
             for name in names:
                 require_name(f"gait.{key}", name, self.gaits)
         for name, one in self.gaits.items():
-            low, high = (gait_setting(self, name, f"force_z_{end}") for end in ("min", "max"))
+            low, high = (gait_setting(self, name, f"grf_z_{end}") for end in ("min", "max"))
             if not low <= high:
                 raise ValueError(
-                    f"gaits.{name}: force_z_min must not exceed force_z_max, got {low} and {high}"
+                    f"gaits.{name}: grf_z_min must not exceed grf_z_max, got {low} and {high}"
                 )
             if one.transition_gait:
                 require_name(f"gaits.{name}.transition_gait", one.transition_gait, self.gaits)

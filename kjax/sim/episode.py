@@ -15,6 +15,7 @@ from kjax.config import (
     SimConfig,
 )
 from kjax.config.gaits import gait_setting
+from kjax.config.units import in_si
 from kjax.legs.base import build_base
 from kjax.resolve import build_command
 from kjax.robots import go1
@@ -113,7 +114,8 @@ def reference_height(
       time: (N,) since the start [s].
       config: of the run.
     """
-    heights = [gait_setting(config, one.name, "height") for one in build_gaits(config)]
+    si = in_si(config, go1.PARAMS)
+    heights = [gait_setting(si, one.name, "body_height") for one in build_gaits(config)]
     command = build_command(config.command)
     piece = np.searchsorted(command.times, time + 1e-9, side="right") - 1
     return np.array(heights)[gait] + command.values[piece, COMMAND_NAMES.index("height")]
@@ -121,7 +123,8 @@ def reference_height(
 
 def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
     """Qpos and qvel of the robot, standing, disturbed as the config and its seed say."""
-    height, joints = go1.stand_pose(gait_setting(config, config.gait.names[0], "height"))
+    si = in_si(config, go1.PARAMS)
+    height, joints = go1.stand_pose(gait_setting(si, config.gait.names[0], "body_height"))
     qpos, qvel = np.zeros(15), np.zeros(15)
     qpos[1], qpos[3:] = height, joints.reshape(-1)
     spread, noise = config.noise, np.random.default_rng([config.seed, 0])

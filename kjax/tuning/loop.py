@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from kjax import gait
 from kjax.config import NoiseConfig, RunConfig
 from kjax.config.gaits import gait_setting
+from kjax.config.units import in_si
 from kjax.controller import build_controller
 from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState
@@ -324,7 +325,7 @@ def draw_scenarios(
     """
     rng = np.random.default_rng(seed)
     noise = config.noise if config.noise.enabled else _silent()
-    height = gait_setting(config, config.gait.names[0], "height")
+    height = gait_setting(in_si(config, robot), config.gait.names[0], "body_height")
     times = np.arange(pieces) * config.duration / pieces
     mass, inertia = body_numbers(config, robot)
     nominal = body_plant.nominal_plant(robot, mass, inertia, config.sim.friction)

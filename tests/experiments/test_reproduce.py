@@ -305,14 +305,14 @@ def test_a_quick_reproduction_leaves_page_table_and_json_and_goes_on(
     assert "changed" not in capsys.readouterr().out
 
     (rough,) = (e for e in experiments.paper_results.EXPERIMENTS if e.name == "trot_rough")
-    rough.overrides["leg.apex"] = 0.09
+    rough.overrides["leg.swing_height"] = 0.2
     try:
         monkeypatch.setattr(sys, "argv", ["reproduce", *options, "--only", "koopman_fit"])
         monkeypatch.setattr(experiments.reproduce, "_fit", lambda *a, **k: {
             "largest_scale_within_tolerance": {"trot": {"max": None}}})  # fmt: skip
         experiments.reproduce.main()
     finally:
-        del rough.overrides["leg.apex"]
+        del rough.overrides["leg.swing_height"]
     assert "trot_rough (planar): its config has changed; its results are dropped" in (
         capsys.readouterr().out
     )

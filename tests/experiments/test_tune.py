@@ -42,12 +42,10 @@ def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(t
     assert all(entry["runs"] == 2 for entry in record["mujoco"].values())
     assert record["held_out_cost"]["gradient"] <= record["held_out_cost"]["start"]
     assert record["descent"]["updates"] == 5
-    assert len(record["values"]["start"]["lmpc.state_weights"]) == 6
+    assert len(record["values"]["start"]["lmpc.Q"]) == 6
     assert {p.name for p in tmp_path.iterdir()} >= {"tuned.toml", "table.md", "figure.png"}
     tuned = load_config(RunConfig, tmp_path / "tuned.toml")
-    assert list(tuned.lmpc.state_weights) == pytest.approx(
-        record["values"]["gradient"]["lmpc.state_weights"]
-    )
+    assert list(tuned.lmpc.Q) == pytest.approx(record["values"]["gradient"]["lmpc.Q"])
     # Other options, same folder: refused.
     other = tune(*SMALL, "--rate", "0.3", "--out", str(tmp_path))
     assert other.returncode == 2

@@ -12,6 +12,7 @@ import pytest
 from kjax import planning, srb
 from kjax.config import GaitConfig, Gaits, LmpcConfig, RunConfig
 from kjax.config.gaits import LIBRARY
+from kjax.config.units import in_si
 from kjax.koopman import models, observables
 from kjax.legs.kinematics import LegTrig, leg_trig
 from kjax.mpc import lmpc
@@ -29,25 +30,28 @@ G = 9.81
 FREE = LmpcConfig(
     horizon=4,
     model_dt=0.005,
-    force_x_max=np.inf,
-    force_z_min=-np.inf,
-    force_z_max=np.inf,
+    grf_x_max=np.inf,
+    grf_z_min=-np.inf,
+    grf_z_max=np.inf,
     tolerance=1e-11,
 )
 FREE_BOUND = dataclasses.replace(
-    LIBRARY["bound"], force_x_max=np.inf, force_z_min=-np.inf, force_z_max=np.inf
+    LIBRARY["bound"], grf_x_max=np.inf, grf_z_min=-np.inf, grf_z_max=np.inf
 )
 BOUNDED = LmpcConfig(
-    horizon=4, model_dt=0.005, force_z_min=5.0, tolerance=1e-9, input_reference="zero"
+    horizon=4, model_dt=0.005, grf_z_min=0.04, tolerance=1e-9, input_reference="zero"
 )
 # A bound's own weights and bounds, all unlike those of the other modes.
 BOUND = GaitConfig(
-    state_weights=(900.0, 1e4, 500.0, 5.0, 2.0, 0.2),
-    input_weight=3e-5,
-    force_x_max=40.0,
-    force_z_min=20.0,
-    force_z_max=300.0,
+    Q=(163.0, 1815.0, 500.0, 21.0, 8.4, 4.6),
+    R=0.47,
+    grf_x_max=0.32,
+    grf_z_min=0.16,
+    grf_z_max=2.4,
 )
+WEIGHT, LENGTH = float(go1.PARAMS.mass) * 9.81, 0.426  # N, m
+# Units of Q: length, angle, speed sqrt(g L), pitch rate sqrt(g / L).
+STATE_UNITS = np.array([LENGTH**-2] * 2 + [1.0] + [1 / (9.81 * LENGTH)] * 2 + [LENGTH / 9.81])
 SPEC = ControllerSpec(horizon=4, model_dt=0.005, tolerance=1e-9)
 FREE_SPEC = dataclasses.replace(SPEC, tolerance=1e-11)
 AHEAD = 0.005 * np.arange(1, 5)  # s
@@ -69,7 +73,7 @@ def mode_settings(lmpc, bound, force):
     names = ["bound" if mode in (Mode.FRONT, Mode.REAR) else "trot" for mode in Mode]
     config = RunConfig(lmpc=lmpc, gaits=Gaits({"bound": bound, "trot": GaitConfig()}))
     problems = [Problem(gait=int(mode), mode=mode) for mode in Mode]
-    return problem_settings(config, problems, names, force)
+    return problem_settings(in_si(config, go1.PARAMS), problems, names, force)
 
 
 def build(model, feet, config, bound):
@@ -155,7 +159,7 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
     assert plan.status == Status.SOLVED
     response, forced = horizon_by_hand(model, mode, FREE, x)
     own = FREE_BOUND if mode in (Mode.FRONT, Mode.REAR) else FREE
-    Q, R = np.tile(own.state_weights, 4), np.full(16, own.input_weight)
+    Q, R = np.tile(own.Q * STATE_UNITS, 4), np.full(16, own.R / WEIGHT**2)
     hover = np.tile([0.0, MASS * G / MODE_ALPHA[mode].sum()], 8)
     standing = np.tile(np.repeat(MODE_ALPHA[mode] > 0, 2), 4)
     rows = np.concatenate([np.sqrt(Q)[:, None] * forced, np.diag(np.sqrt(R))])[:, standing]
@@ -175,7 +179,9 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
 def test_plans_respect_the_bounds_and_swing_legs_get_exactly_no_force(mode, name, bounded, start):
     spec = ControllerSpec(horizon=4, model_dt=0.005)  # default tolerance
     tables = cast(bounded, name)
-    limits = [40.0, 20.0, 300.0] if mode in (Mode.FRONT, Mode.REAR) else [60.0, 5.0, 160.0]
+    own = BOUND if mode in (Mode.FRONT, Mode.REAR) else BOUNDED
+    limits = np.array([own.grf_x_max, own.grf_z_min, own.grf_z_max]) * WEIGHT
+    limits = limits.astype(name)
     for scale in (1.0, 30.0):  # the larger disturbance drives every force to a bound
         x, reference = (jnp.asarray(a, name) for a in start)
         z = lift(scale * (x - reference[0]) + reference[0])
@@ -317,13 +323,14 @@ def test_the_mean_force_becomes_the_input_reference_of_standing_legs(mode):
 def test_front_and_rear_stance_have_the_bound_s_weights_and_limits_and_the_others_their_own(mode):
     settings = mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
     single = mode in (Mode.FRONT, Mode.REAR)
-    weights = [900.0, 1e4, 500.0, 5.0, 2.0, 0.2] if single else list(BOUNDED.state_weights)
-    np.testing.assert_array_equal(settings.state_weights[mode], weights)
-    np.testing.assert_array_equal(settings.input_weights[mode], 3e-5 if single else 1e-5)
+    own = BOUND if single else BOUNDED
+    close = partial(np.testing.assert_allclose, rtol=1e-14)  # rounding of products
+    close(settings.state_weights[mode], np.array(own.Q) * STATE_UNITS)
+    close(settings.input_weights[mode], own.R / WEIGHT**2)
     standing = np.repeat(MODE_ALPHA[mode] > 0, 2)
-    lower, upper = ([-40.0, 20.0], [40.0, 300.0]) if single else ([-60.0, 5.0], [60.0, 160.0])
-    np.testing.assert_array_equal(settings.lower[mode], standing * np.tile(lower, 2))
-    np.testing.assert_array_equal(settings.upper[mode], standing * np.tile(upper, 2))
+    low, high = ([-0.32, 0.16], [0.32, 2.4]) if single else ([-0.48, 0.04], [0.48, 1.28])
+    close(settings.lower[mode], standing * np.tile(low, 2) * WEIGHT)
+    close(settings.upper[mode], standing * np.tile(high, 2) * WEIGHT)
 
 
 def test_the_contact_points_of_each_mode_enter_its_own_tables(fitted_moving_feet, body):

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 from kjax import gait
 from kjax.config import RunConfig, load_config
+from kjax.config.units import in_si
 from kjax.mpc import multiphase
 from kjax.resolve import multiphase_params
 from kjax.robots import go1
@@ -16,6 +17,7 @@ from kjax.types import GRAVITY, Leg
 from kjax.walkable import build_gaits, cycle_nodes
 
 COUNT = 15
+WEIGHT, LENGTH = float(go1.PARAMS.mass) * GRAVITY, 0.426  # N, m
 BOUND = 1  # index of the gait
 FRONT, FIRST_FLIGHT, REAR, SECOND_FLIGHT = range(4)
 DURATION = (0.1, 0.1, 0.05, 0.1)  # s
@@ -33,15 +35,15 @@ def config():
         "multiphase.height_time": 0.05,
     }
     own = {
-        "state_weights": [16.0, 151.0, 13.8, 38.2, 2.67, 0.145],
-        "input_weight": 1.7e-6,
-        "force_x_max": 135.0,
-        "force_z_min": 10.0,
-        "force_z_max": 250.0,
-        "feet_front": 0.05,
-        "feet_rear": 0.1,
-        "velocity_gain": 0.075,
-        "height": 0.27,
+        "Q": [2.9, 27.4, 13.8, 160.0, 11.2, 3.34],
+        "R": 0.02657,
+        "grf_x_max": 135.0 / WEIGHT,
+        "grf_z_min": 10.0 / WEIGHT,
+        "grf_z_max": 250.0 / WEIGHT,
+        "foothold_front": 0.05 / LENGTH,
+        "foothold_rear": 0.1 / LENGTH,
+        "foothold_gain": 0.075 / (LENGTH / 9.81) ** 0.5,
+        "body_height": 0.27 / LENGTH,
     }
     keys |= {f"gaits.bound_multiphase.{key}": value for key, value in own.items()}
     return load_config(RunConfig, None, keys)
@@ -49,7 +51,7 @@ def config():
 
 @pytest.fixture(scope="module")
 def params(config):
-    params = multiphase_params(build_gaits(config), config, go1.PARAMS)
+    params = multiphase_params(build_gaits(config), in_si(config, go1.PARAMS), go1.PARAMS)
     return multiphase.for_gait(params, jnp.asarray(BOUND))
 
 

@@ -27,7 +27,7 @@ OWN = (
     {},
     {"command.v_x": [0.3, 0.3, 0.3, 0.3, 0.3], "terrain.seed": 3},
     {"push.times": [0.1], "push.forward": 4.0, "sim.friction": 0.6, "terrain.height_max": 0.09},
-    {"sim.payload": 2.0, "sim.delay": 0.005, "lmpc.height": 0.25},
+    {"sim.payload": 2.0, "sim.delay": 0.005, "lmpc.body_height": 0.5869},
     {"noise.position": 0.0, "seed": 7},
 )
 

@@ -140,7 +140,7 @@ def test_the_robot_starts_on_its_feet():
     mujoco.mj_forward(simulation.model, data)
     feet = [data.geom(f"{leg}_foot").xpos[2] for leg in ("FR", "FL", "RR", "RL")]
     np.testing.assert_allclose(feet, go1.FOOT_RADIUS, atol=1e-9)
-    assert data.subtree_com[0, 2] == pytest.approx(0.27, abs=1e-9)
+    assert data.subtree_com[0, 2] == pytest.approx(0.426 * 0.6338, abs=1e-9)
 
 
 def test_slip_of_a_rolling_foot_is_zero_and_of_a_dragged_one_its_path():
@@ -227,7 +227,7 @@ def test_front_feet_of_a_bound_touch_down_together_and_apart_from_the_rear_ones(
 def test_trot_to_bound_and_back_in_place(seed):
     """Bound asked for at 1 s, trot again at 2 s; with the prediction over 0.2 s."""
     chosen = IN_PLACE | {"duration": 6.0, "lmpc.model_dt": 0.02, "lmpc.horizon": 10}
-    chosen |= {"lmpc.state_weights": [20.0, 100.0, 50.0, 6.0, 1.0, 0.15]}
+    chosen |= {"lmpc.Q": [3.63, 18.15, 50.0, 25.07, 4.179, 3.454]}
     chosen |= {"gait.names": ["trot", "bound", "trot"], "gait.times": [0.0, 1.0, 2.0]}
     simulation = build_simulation(load_config(RunConfig, None, chosen))
     run = simulate(simulation, seed=seed)

@@ -32,14 +32,14 @@ VALUES = {
         for key, value in {
             "transition_gait": "stand",
             "switch_rule": "cycle_end",
-            "height": 0.28,
-            "state_weights": [1000.0, 2e4, 1000.0, 10.0, 2.0, 0.1],
-            "input_weight": 2e-6,
-            "force_x_max": 55.0,
-            "force_z_min": 10.0,
-            "force_z_max": 290.0,
-            "velocity_gain": 0.05,
-            "apex": 0.07,
+            "body_height": 0.657,
+            "Q": [181.0, 3630.0, 1000.0, 42.0, 8.4, 2.3],
+            "R": 0.03,
+            "grf_x_max": 0.44,
+            "grf_z_min": 0.08,
+            "grf_z_max": 2.3,
+            "foothold_gain": 0.24,
+            "swing_height": 0.164,
         }.items()
     },
     "lmpc.control_dt": 0.01,
@@ -71,7 +71,8 @@ STATIC = {
 LEFT_OUT = {
     "koopman.file", "gait.times", "command.times", "push.times", "push.lateral",
     "command.v_y", "command.yaw_rate", "command.roll", "command.pitch",
-    "gaits.trot.feet_front", "gaits.trot.feet_rear", "gaits.trot.reference", "gaits.trot.horizon",
+    "gaits.trot.foothold_front", "gaits.trot.foothold_rear",
+    "gaits.trot.reference", "gaits.trot.horizon",
 }  # fmt: skip
 # The gaits that are compiled unless a config says otherwise; the keys of the others are the same.
 GAITS = ("gaits.trot.", "gaits.bound.")
@@ -143,7 +144,7 @@ def test_nodes_of_a_cycle_make_another_program():
         for own in ({}, {"multiphase.node_dt": 0.025}, {"multiphase.tolerance": 1e-7})
     ]
     assert len(set(specs)) == 3
-    data = {"multiphase.friction": 0.5, "gaits.bound_multiphase.height": 0.28}
+    data = {"multiphase.friction": 0.5, "gaits.bound_multiphase.body_height": 0.6573}
     assert specs[0] == scene.batch_spec(load_config(RunConfig, None, cycle | data))
 
 
@@ -166,7 +167,7 @@ def test_parameters_of_a_batch_are_those_of_its_robots():
         load_config(RunConfig, None, overrides)
         for overrides in (
             {"command.times": [0.0], "command.v_x": [0.4]},
-            {"lmpc.height": 0.25, "command.times": [0.0, 1.0], "command.v_x": [0.1, 0.2]},
+            {"lmpc.body_height": 0.5869, "command.times": [0.0, 1.0], "command.v_x": [0.1, 0.2]},
             {"gait.names": ["trot", "bound"], "gait.times": [0.0, 2.0]},
         )
     ]

@@ -67,8 +67,8 @@ def test_it_walks_up_and_down_a_slope(slope):
         "terrain.end": 2.0,
         "lmpc.model_dt": 0.02,
         "lmpc.horizon": 10,
-        "lmpc.state_weights": [10.0, 100.0, 50.0, 2.0, 1.0, 0.2],
-        "leg.apex": 0.10,
+        "lmpc.Q": [1.815, 18.15, 50.0, 8.358, 4.179, 4.606],
+        "leg.swing_height": 0.2347,
     }
     config = load_config(RunConfig, None, keys)
     result = metrics(simulate(build_simulation(config), seed=1), config)

@@ -26,16 +26,16 @@ CONFIG = load_config(
         "gaits.bound.duty": [0.4, 0.4, 0.2, 0.2],
         "gaits.bound.ramp_cycles": 2,
         # Over 6 ms at the bound's own weights the loop is chaotic: see the benchmark's README row.
-        "gaits.bound.input_weight": 5e-6,
+        "gaits.bound.R": 0.07814,
     },
 )
 KEYS = (
-    "lmpc.state_weights",
-    "gaits.bound.state_weights",
-    "gaits.bound.feet_front",
+    "lmpc.Q",
+    "gaits.bound.Q",
+    "gaits.bound.foothold_front",
     "gaits.bound.force_edge",
-    "gaits.bound.force_z_min",
-    "gaits.bound.velocity_gain",
+    "gaits.bound.grf_z_min",
+    "gaits.bound.foothold_gain",
 )
 COUNT = 4
 
@@ -152,8 +152,9 @@ def test_a_foot_lands_where_raiberts_law_says(space, run, scenarios):
     x, com, hip = one.x[tick], scenarios.plant.com[0], go1.PARAMS.hip_pos[0, ::2]
     c, s = np.cos(x[2]), np.sin(x[2])
     along = float(x[0]) + c * (hip[0] - com[0]) - s * (hip[1] - com[1])
-    along += CONFIG.gaits.bound.feet_front - hip[0] + x[3] * 0.5 * 0.1
-    along += CONFIG.gaits.bound.velocity_gain * (x[3] - one.wanted[tick - 1, 0])
+    along += 0.426 * CONFIG.gaits.bound.foothold_front - hip[0] + x[3] * 0.5 * 0.1
+    gain = (0.426 / 9.81) ** 0.5 * CONFIG.gaits.bound.foothold_gain
+    along += gain * (x[3] - one.wanted[tick - 1, 0])
     assert one.feet[tick, 0, 0] == pytest.approx(float(along), abs=1e-12)
 
 

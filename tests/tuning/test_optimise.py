@@ -7,7 +7,7 @@ from kjax import RunConfig
 from kjax.tuning import optimise
 from kjax.tuning.space import build_space
 
-SPACE = build_space(RunConfig(), ["lmpc.state_weights", "lmpc.input_weight"])
+SPACE = build_space(RunConfig(), ["lmpc.Q", "lmpc.R"])
 TARGET = {key: one + 0.7 for key, one in SPACE.start.items()}
 TRAIN, HELD_OUT = jnp.linspace(-0.1, 0.1, 4), jnp.linspace(-0.05, 0.05, 3)
 
@@ -68,7 +68,7 @@ def test_a_checkpoint_of_another_tuning_is_refused(tmp_path):
 def test_what_is_not_finite_is_named_and_the_last_good_point_comes_back():
     def bad_cost(variables, scenario):
         value = bowl(variables, scenario)
-        late = variables["lmpc.input_weight"] > SPACE.start["lmpc.input_weight"] + 0.6
+        late = variables["lmpc.R"] > SPACE.start["lmpc.R"] + 0.6
         return jnp.where(late & (scenario > 0.09), jnp.nan, value)
 
     result = optimise.descend(bad_cost, SPACE, TRAIN, HELD_OUT, updates=60, rate=0.1)
@@ -84,11 +84,11 @@ def test_what_is_not_finite_is_named_and_the_last_good_point_comes_back():
     root.defjvp(lambda p, t: (p[0], t[0] * jnp.where(p[0] > 0.0, jnp.nan, 1.0)))
 
     def bad_slope(variables, scenario):
-        gone = variables["lmpc.input_weight"] - SPACE.start["lmpc.input_weight"] - 0.6
+        gone = variables["lmpc.R"] - SPACE.start["lmpc.R"] - 0.6
         return bowl(variables, scenario) + 1e-9 * root(gone)
 
     result = optimise.descend(bad_slope, SPACE, TRAIN, HELD_OUT, updates=60, rate=0.1)
-    assert "the gradient of scenario 0 by lmpc.input_weight is not finite" in result.stopped
+    assert "the gradient of scenario 0 by lmpc.R is not finite" in result.stopped
     assert all(np.isfinite(one).all() for one in result.best.values())
 
 

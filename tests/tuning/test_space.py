@@ -11,8 +11,8 @@ from kjax.robots import go1
 from kjax.tuning.space import TUNABLE, build_space, tuned_config
 
 BOUND = load_config(RunConfig, None, {"gait.names": ["bound"]})
-SOME = ("lmpc.state_weights", "lmpc.force_z_min", "leg.velocity_gain", "gaits.bound.feet_front",
-        "gaits.bound.force_edge", "gaits.bound.input_weight", "multiphase.height_time")  # fmt: skip
+SOME = ("lmpc.Q", "lmpc.grf_z_min", "leg.foothold_gain", "gaits.bound.foothold_front",
+        "gaits.bound.force_edge", "gaits.bound.R", "multiphase.height_time")  # fmt: skip
 
 
 def test_the_variables_of_a_config_give_its_own_parameters():
@@ -41,40 +41,42 @@ def value(config, key):
 
 
 def test_a_gait_of_ones_own_may_be_tuned():
-    config = load_config(RunConfig, None, {"gaits.own.height": 0.26, "gait.names": ["own"]})
-    space = build_space(config, ["gaits.own.height"])
-    params = space.params({"gaits.own.height": jnp.log(0.25)})
-    np.testing.assert_allclose(params.height, [0.27, 0.27, 0.27, 0.25], rtol=1e-6)
-    assert space.kinds == {"gaits.own.height": TUNABLE["gaits.trot.height"]}
-    with pytest.raises(ValueError, match=r"gaits\.own\.apex' is no variable"):
-        build_space(config, ["gaits.own.apex"])
-    with pytest.raises(ValueError, match=r"gaits\.own\.state_weights is not given by the config"):
-        build_space(config, ["gaits.own.state_weights"])
+    config = load_config(RunConfig, None, {"gaits.own.body_height": 0.61, "gait.names": ["own"]})
+    space = build_space(config, ["gaits.own.body_height"])
+    params = space.params({"gaits.own.body_height": jnp.log(0.6)})
+    np.testing.assert_allclose(
+        params.height, 0.426 * np.array([0.6338, 0.6338, 0.6338, 0.6]), rtol=1e-6
+    )
+    assert space.kinds == {"gaits.own.body_height": TUNABLE["gaits.trot.body_height"]}
+    with pytest.raises(ValueError, match=r"gaits\.own\.swing_height' is no variable"):
+        build_space(config, ["gaits.own.swing_height"])
+    with pytest.raises(ValueError, match=r"gaits\.own\.Q is not given by the config"):
+        build_space(config, ["gaits.own.Q"])
 
 
 def test_a_tuned_config_holds_the_new_values_and_no_others():
-    new = tuned_config(BOUND, {"gaits.bound.force_edge": 0.4, "lmpc.state_weights": [1.0] * 6})
+    new = tuned_config(BOUND, {"gaits.bound.force_edge": 0.4, "lmpc.Q": [1.0] * 6})
     assert new.gaits.bound.force_edge == 0.4
-    assert new.lmpc.state_weights == (1.0,) * 6
+    assert new.lmpc.Q == (1.0,) * 6
     assert new.gaits.bound == dataclasses.replace(BOUND.gaits.bound, force_edge=0.4)
     assert new.command == BOUND.command
 
 
 def test_a_step_of_a_tenth_is_ten_per_cent_of_a_weight():
-    space = build_space(BOUND, ["gaits.bound.state_weights"])
+    space = build_space(BOUND, ["gaits.bound.Q"])
     moved = {key: one + 0.1 for key, one in space.start.items()}
-    own = BOUND.gaits.bound.state_weights
-    ratio = np.array(space.overrides(moved)["gaits.bound.state_weights"]) / own
+    own = BOUND.gaits.bound.Q
+    ratio = np.array(space.overrides(moved)["gaits.bound.Q"]) / own
     np.testing.assert_allclose(ratio, np.exp(0.1), rtol=1e-12)
 
 
 def test_variables_are_brought_back_into_what_a_config_may_hold():
-    space = build_space(BOUND, ["gaits.bound.force_edge", "gaits.bound.velocity_gain"])
+    space = build_space(BOUND, ["gaits.bound.force_edge", "gaits.bound.foothold_gain"])
     far = {key: one + 100.0 for key, one in space.start.items()}
     inside = space.overrides(space.inside(far))
     assert inside["gaits.bound.force_edge"] == pytest.approx(TUNABLE["gaits.bound.force_edge"].high)
-    assert inside["gaits.bound.velocity_gain"] == pytest.approx(
-        TUNABLE["gaits.bound.velocity_gain"].high
+    assert inside["gaits.bound.foothold_gain"] == pytest.approx(
+        TUNABLE["gaits.bound.foothold_gain"].high
     )
     tuned_config(BOUND, inside)  # is valid
 
@@ -96,9 +98,9 @@ def test_the_mass_of_a_rigid_body_model_is_a_variable_of_its_prediction():
         (["srb.mass"], {}, "fitted to data"),
         ([], {}, "at least one"),
         (
-            ["lmpc.state_weights"],
-            {"lmpc.state_weights": [0.0, 1.0, 1.0, 1.0, 1.0, 1.0]},
-            "lmpc.state_weights must be positive",
+            ["lmpc.Q"],
+            {"lmpc.Q": [0.0, 1.0, 1.0, 1.0, 1.0, 1.0]},
+            "lmpc.Q must be positive",
         ),
     ],
 )

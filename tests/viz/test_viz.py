@@ -46,11 +46,11 @@ def test_the_figure_knows_the_height_and_the_stride_of_the_gait_that_is_walked(
         close(fig)
 
     monkeypatch.setattr(plots.plt, "close", look)
-    bound = load_config(RunConfig, None, {"gaits.bound.height": 0.301})
+    bound = load_config(RunConfig, None, {"gaits.bound.body_height": 0.7})
     half = np.arange(len(run.time)) >= len(run.time) // 2
     switched = dataclasses.replace(run, gait=np.where(half, 1, 0))
     plots.closed_loop_figure(switched, bound, tmp_path / "figure.png")
-    np.testing.assert_array_equal(drawn["height"], np.where(half, 0.301, 0.27))
+    np.testing.assert_allclose(drawn["height"], 0.426 * np.where(half, 0.7, 0.6338), rtol=1e-14)
     assert plots.stride_time(switched.gait[half], bound) == pytest.approx(0.35)
     assert plots.stride_time(switched.gait[~half], bound) == pytest.approx(0.5)
 
