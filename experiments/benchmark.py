@@ -130,7 +130,7 @@ def _walk(simulation: Simulation) -> tuple[list[Any], list[np.ndarray], mujoco.M
     """Controller states and sensor vectors along a walk, and the data at its end."""
     model, at = simulation.model, simulation.addresses
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(simulation.config, model.nq, model.nv)
+    data.qpos[:], data.qvel[:] = initial_state(simulation.config, model)
     mujoco.mj_forward(model, data)
     states, sensed = [], []
     noise = noise_dim(simulation.config.sim.base)

@@ -13,7 +13,7 @@ from kjax.config import KoopmanConfig, SrbConfig
 from kjax.koopman import edmd, observables
 from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
 from kjax.rigid_body import own_body
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 PAPER = observables.paper(4)
@@ -32,7 +32,7 @@ class Setting(NamedTuple):
 
 def setting() -> Setting:
     """Trot, Go1, and the ranges that the controller's models are fitted on."""
-    config, body = KoopmanConfig().dataset, own_body(SrbConfig(), go1.PARAMS)
+    config, body = KoopmanConfig().dataset, own_body(SrbConfig(), get_robot().params)
     return Setting(
         body=jax.tree.map(lambda leaf: leaf[Mode.TROT], edmd.srb_params(body)),
         alpha=jnp.asarray(MODE_ALPHA[Mode.TROT], float),

@@ -18,7 +18,7 @@ from kjax.koopman.dataset import SampleRanges, ranges_from_config, shrink
 from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
 from kjax.koopman.validate import ErrorStatistics, prediction_errors, summarise
 from kjax.rigid_body import own_body
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.types import MODE_ALPHA, STATE_NAMES, STATE_UNITS, Mode
 
 MODES = {"trot": Mode.TROT, "front": Mode.FRONT, "rear": Mode.REAR}
@@ -55,7 +55,10 @@ def fit_study(config: FitStudyConfig) -> tuple[dict[str, Any], dict[str, Any]]:
       ValueError: if the fit is not finite.
     """
     koopman, data = config.koopman, config.koopman.dataset
-    dictionary, body = build_dictionary(koopman), srb_params(own_body(config.srb, go1.PARAMS))
+    dictionary, body = (
+        build_dictionary(koopman),
+        srb_params(own_body(config.srb, get_robot(config.robot).params)),
+    )
     steps = round(config.test_duration / data.dt)
     chosen = jnp.asarray(list(MODES.values()))
 

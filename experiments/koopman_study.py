@@ -23,7 +23,7 @@ from kjax.config import SrbConfig
 from kjax.koopman import edmd, families, learned, observables, validate
 from kjax.koopman.dataset import SampleRanges, sample
 from kjax.rigid_body import own_body
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 DT = 1e-3  # s
@@ -83,7 +83,7 @@ def residual_ratios(folder: Path) -> dict[str, float]:
 
 def study(args: argparse.Namespace) -> dict[str, Any]:
     """Errors of all models: ranges -> mode -> model -> statistics against the horizon."""
-    body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
+    body = edmd.srb_params(own_body(SrbConfig(), get_robot().params))
     states, profiles = (10, 10) if args.quick else (STARTS, PROFILES)
     out: dict[str, Any] = {"horizons_s": HORIZONS, "errors": {}, "spectrum": {}}
     chosen = {"trot": Mode.TROT} if args.quick else MODES

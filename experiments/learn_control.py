@@ -24,7 +24,7 @@ from kjax.koopman import edmd, families, learned, storage
 from kjax.koopman.dataset import ranges_from_config, sample
 from kjax.resolve import resolve
 from kjax.rigid_body import own_body
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.sim.batch_loop import BatchEngine
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.summary import summarise
@@ -49,7 +49,7 @@ def main() -> None:
     save(path, plain)
     print(f"trained for prediction ({time.perf_counter() - clock:.0f} s)", flush=True)
     config = short(args, path)
-    _, params = resolve(config, go1.PARAMS)
+    _, params = resolve(config)
     train_on = loop.draw_scenarios(config, TRAIN_SEED, args.scenarios)
     costs = costs_of(params, loop.build_loop(config, memory=MEMORY))
     both, how_both = train(args, data, lambda model: args.weight * costs(model, train_on).mean())
@@ -124,7 +124,10 @@ def short(args: argparse.Namespace, path: Path) -> RunConfig:
 def draw(seed: int, rollouts: int) -> Any:
     """Rollouts of the trot's rigid body on the ranges of the config."""
     config = RunConfig()
-    body = jax.tree.map(lambda a: a[Mode.TROT], edmd.srb_params(own_body(config.srb, go1.PARAMS)))
+    body = jax.tree.map(
+        lambda a: a[Mode.TROT],
+        edmd.srb_params(own_body(config.srb, get_robot(config.robot).params)),
+    )
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
     ranges = ranges_from_config(config.koopman.dataset, vary_feet=False)
     one = partial(sample, rollouts=rollouts, steps=STEPS, dt=DT)
@@ -163,7 +166,7 @@ def costs_of(params: Any, run: loop.Loop) -> Any:
         fits = params.fits
         fits = fits._replace(prediction=fits.prediction._replace(numbers=stacked(model)))
         own = params._replace(fits=fits)
-        return jax.vmap(lambda s: loop.cost(go1.PARAMS, run(own, s)))(scenarios)
+        return jax.vmap(lambda s: loop.cost(get_robot().params, run(own, s)))(scenarios)
 
     return costs
 

@@ -28,7 +28,7 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
     plan, act = jax.jit(controller.plan), jax.jit(controller.act)
     look = jax.jit(lambda state, seen: recorder.plan(tables, state, seen)[0].memory)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+    data.qpos[:], data.qvel[:] = initial_state(config, model)
     mujoco.mj_forward(model, data)
     state, kept = None, []
     steps = round(seconds / config.sim.sim_dt)

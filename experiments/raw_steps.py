@@ -29,9 +29,11 @@ from kjax import cli
 from kjax.batches import batch_key, run_batch
 from kjax.config import CommandConfig, RunConfig, load_config
 from kjax.episodes import Store, code_version
+from kjax.robots import get_robot
 from kjax.sim.contacts import body_contact
 from kjax.sim.episode import Trajectory
 from kjax.sim.intervals import median_interval, wilson
+from kjax.sim.observe import find_addresses
 from kjax.sim.scene import build_model
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -166,7 +168,7 @@ def after_step(run: Trajectory, config: RunConfig) -> dict[str, Any]:
     """What an episode did from its step on, and whether its body ever touched the ground."""
     begin = config.command.times[-1]
     later = run.time >= begin - 1e-9
-    touched = body_contact(_model(config.sim.base, config.sim.contacts), run.qpos)
+    touched = body_contact(*_scene(config.robot, config.sim.base, config.sim.contacts), run.qpos)
     pitch = np.degrees(np.abs(run.x[later, 2]))
     return {
         "step_time_s": begin,
@@ -178,10 +180,12 @@ def after_step(run: Trajectory, config: RunConfig) -> dict[str, Any]:
 
 
 @lru_cache
-def _model(base: str, contacts: str) -> Any:
-    """The scene of all episodes, for collisions only."""
+def _scene(name: str, base: str, contacts: str) -> tuple[Any, Any]:
+    """The scene of all episodes, for collisions only, and the robot's addresses in it."""
     sim = load_config(RunConfig, None, {"sim.base": base, "sim.contacts": contacts}).sim
-    return build_model(sim, visual=False)
+    robot = get_robot(name)
+    model = build_model(robot, sim, visual=False)
+    return model, find_addresses(robot, model)
 
 
 def measured(case: Case, args: Namespace, store: Store) -> list[dict[str, Any]]:

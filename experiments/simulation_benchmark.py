@@ -20,7 +20,8 @@ import numpy as np
 import simulation_report
 
 from kjax.config import RunConfig, load_config
-from kjax.sim.batch_loop import BatchEngine, dressed
+from kjax.robots import get_robot
+from kjax.sim.batch_loop import BatchEngine, scene_models
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.mjx_loop import MjxEngine
@@ -129,12 +130,12 @@ def bare_batch(
     engine: BatchEngine, configs: Sequence[RunConfig], torque: np.ndarray, torques: str
 ) -> Callable[[], float]:
     """MuJoCo's own batch with as many threads, fed recorded torques: time of a run [s]."""
-    model = dressed(engine.model, configs[:1])[0]
+    model = scene_models(engine.model, configs[:1])[0]
     per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
     batch = mujoco.batch.Batch(model, nsim=len(configs), nthread=engine.threads)
     qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    order = np.argsort(find_addresses(model).actuator.reshape(-1))
-    starts = [initial_state(config, model.nq, model.nv) for config in configs]
+    order = np.argsort(find_addresses(get_robot(), model).actuator.reshape(-1))
+    starts = [initial_state(config, model) for config in configs]
 
     def once() -> float:
         batch.reset()
@@ -175,7 +176,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     model = mjx.put_model(engine.model)
     steps = round(WALK_MJX / configs[0].sim.sim_dt)
     per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
-    order = np.argsort(find_addresses(engine.model).actuator.reshape(-1))
+    order = np.argsort(find_addresses(get_robot(), engine.model).actuator.reshape(-1))
 
     def begin(qpos: Any, qvel: Any) -> Any:
         data = mjx.make_data(model)
@@ -192,7 +193,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
 
         return jax.lax.scan(tick, data, torque)
 
-    starts = [initial_state(config, engine.model.nq, engine.model.nv) for config in configs]
+    starts = [initial_state(config, engine.model) for config in configs]
     qpos, qvel = (np.stack(a) for a in zip(*starts, strict=True))
     data = jax.jit(jax.vmap(begin))(qpos, qvel)
     bare = jax.jit(jax.vmap(walk, (0, 1)))

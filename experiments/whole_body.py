@@ -40,7 +40,7 @@ from kjax.koopman.prediction import build_family, model_spec
 from kjax.koopman.transitions import Episode, Transitions, split, transitions
 from kjax.resolve import fit_models
 from kjax.rigid_body import own_body
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.types import Mode
 from kjax.walkable import build_gaits, contact_problems
 
@@ -144,7 +144,7 @@ def study(
     numbers = np.arange(len(episodes))
     rest, told = split(numbers, share=HELD_OUT)
     train, tune = split(rest, share=TUNE, seed=1)
-    data = transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
+    data = transitions(episodes, dt=DT, sole=float(get_robot().params.foot_radius))
     fitted, tuned, held = (data.rows(np.isin(data.episode, own)) for own in (train, tune, told))
     print(f"{gait}: {len(train)}, {len(tune)} and {len(told)} episodes to fit, choose and "
           f"report, {len(fitted.x)} rows to fit", flush=True)  # fmt: skip
@@ -228,7 +228,7 @@ def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str
         )
         config, problem = _within_stance(config)
         with jax.enable_x64(True):
-            fits = fit_models(config, go1.PARAMS)
+            fits = fit_models(config, get_robot(config.robot).params)
             family = build_family(model_spec(config.koopman))
             fits = jax.tree.map(lambda a, at=problem: a[at], fits)
             own = fits.model if fits.prediction is None else fits.prediction.numbers
@@ -287,7 +287,7 @@ def _choose(
 
 
 def _body() -> srb.SrbParams:
-    config = own_body(SrbConfig(), go1.PARAMS)
+    config = own_body(SrbConfig(), get_robot().params)
     return srb.SrbParams(
         mass=jnp.asarray(config.mass), inertia=jnp.asarray(config.inertia), feet=jnp.zeros((2, 2))
     )

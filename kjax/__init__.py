@@ -1,7 +1,7 @@
 """kjax: Koopman-operator linear MPC for legged robots, in JAX.
 
     from kjax import RunConfig, build_controller, condense, load_config, resolve
-    from kjax.robots import go1
+    from kjax.robots import get_robot
 
 The core imports jax, numpy and pydantic only; ``kjax.sim`` needs the extra ``sim`` (MuJoCo),
 ``kjax.viz`` the extra ``viz`` (matplotlib).

@@ -35,8 +35,9 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "contact": (4,),
 }
 
-_FOOT_FROM_HIP = 0.20  # m, horizontal; a standing or lying robot's feet are nearer to the thigh
-_SMALL = 0.03  # m, height by which one foot is surely higher than another
+# Of the leg's length: a standing or lying robot's feet are nearer to the thigh along the ground,
+# and a foot that is this much above another is surely higher.
+_FOOT_FROM_HIP, _SMALL = 0.47, 0.07
 
 
 def cast(observation: Observation, dtype: Any) -> Observation:
@@ -145,7 +146,7 @@ def check_observation(robot: RobotParams, observation: Observation) -> None:
     quat, joints = values["base_quat"], values["joint_pos"]
     _check_quaternion(quat)
     _check_rates(values)
-    _check_joints(joints)
+    _check_joints(robot, joints)
     with jax.ensure_compile_time_eval():  # also where the caller traces, with constants
         _check_feet(robot, quat, joints, values["contact"] > 0)
 
@@ -188,14 +189,14 @@ def _check_rates(values: dict[str, np.ndarray]) -> None:
             )
 
 
-def _check_joints(joints: np.ndarray) -> None:
+def _check_joints(robot: RobotParams, joints: np.ndarray) -> None:
     largest = np.abs(joints).max()
     if largest > 2.0 * np.pi:
         raise ValueError(
             f"observation.joint_pos: got an angle of {largest:.4g}, wanted radians; is it in "
             "degrees?"
         )
-    low, high = kinematics.KNEE_RANGE[0] - 0.2, kinematics.KNEE_RANGE[1] + 0.2
+    low, high = np.asarray(robot.joint_range)[2] + [-0.2, 0.2]
     calf = joints[:, 2]
     if (calf > 0).all() and ((-calf > low) & (-calf < high)).all():
         raise ValueError(
@@ -220,7 +221,8 @@ def _check_feet(
     foot = np.asarray(lever)
     side = np.asarray(robot.abduction_offset)
     away = np.hypot(foot[:, 0], foot[:, 1] - side)
-    if away.max() > _FOOT_FROM_HIP:
+    length = float(robot.thigh_length + robot.calf_length)
+    if away.max() > _FOOT_FROM_HIP * length:
         leg = Leg(int(np.argmax(away)))
         raise ValueError(
             f"observation.joint_pos: {leg.name}'s foot is {away[leg]:.2f} m beside its hip, wanted "
@@ -231,7 +233,7 @@ def _check_feet(
     height = ((foot + np.asarray(robot.hip_pos)) @ rotation.T)[:, 2]
     if contact.any() and not contact.all():
         high, low = height[contact].max(), height[~contact].min()
-        if high > low + _SMALL:
+        if high > low + _SMALL * length:
             flagged = Leg(int(np.flatnonzero(contact)[np.argmax(height[contact])]))
             raise ValueError(
                 f"observation.contact: {flagged.name} is in contact {high - low:.2f} m above a "

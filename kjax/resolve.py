@@ -25,12 +25,15 @@ from kjax.mpc import multiphase
 from kjax.mpc.lmpc import ModeSettings
 from kjax.params import ControllerParams, Fits
 from kjax.rigid_body import body_numbers, levers, mean_force, own_body
+from kjax.robots import get_robot
 from kjax.spec import ControllerSpec, CycleSpec
 from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
 from kjax.walkable import Problem, build_gaits, check_walkable, contact_problems, cycle_nodes
 
 
-def resolve(config: RunConfig, robot: RobotParams) -> tuple[ControllerSpec, ControllerParams]:
+def resolve(
+    config: RunConfig, robot: RobotParams | None = None
+) -> tuple[ControllerSpec, ControllerParams]:
     """Spec and parameters of a controller; fits the Koopman models.
 
     A fit whose response to forces is far from the rigid body's along the LMPC's horizon is warned
@@ -38,7 +41,7 @@ def resolve(config: RunConfig, robot: RobotParams) -> tuple[ControllerSpec, Cont
 
     Args:
       config: of the run.
-      robot: e.g. ``kjax.robots.go1.PARAMS``.
+      robot: parameters of the robot; those of ``config.robot`` if ``None``.
 
     Returns:
       What ``build_controller`` takes, and its parameters, NumPy arrays in float64: change or batch
@@ -47,6 +50,7 @@ def resolve(config: RunConfig, robot: RobotParams) -> tuple[ControllerSpec, Cont
     Raises:
       ValueError: for a config that this robot cannot walk with, naming the key.
     """
+    robot = get_robot(config.robot).params if robot is None else robot
     spec = controller_spec(config)
     check_walkable(config, robot)
     with jax.enable_x64(True):
@@ -93,6 +97,7 @@ def controller_key(config: RunConfig) -> Hashable:
     """
     asked = replace(config.gait, times=tuple(map(float, range(len(config.gait.times)))))
     return (
+        config.robot,
         config.srb,
         config.koopman,
         config.lmpc,

@@ -30,6 +30,9 @@ class Leg(IntEnum):
     RL = 3
 
 
+JOINT_NAMES = ("abduction", "thigh", "calf")
+
+
 class Mode(IntEnum):
     """Contact mode of the planar rigid body: how many legs stand in front and behind."""
 
@@ -92,6 +95,10 @@ class RobotParams(NamedTuple):
       calf_length: knee to foot centre [m].
       foot_radius: radius of the spherical foot [m].
       torque_limit: of abduction, thigh and calf joint [N m].
+      joint_range: (joint, low and high) angles that legs are asked for, inside the mechanical
+        limits by a margin [rad].
+      link_inertia: pitch inertia of thigh and calf about their own centres of mass [kg m^2].
+      stand_height: of the centre of mass above the ground in the nominal stance [m].
     """
 
     mass: Float[Array, ""]
@@ -106,6 +113,9 @@ class RobotParams(NamedTuple):
     calf_length: Float[Array, ""]
     foot_radius: Float[Array, ""]
     torque_limit: Float[Array, "3"]
+    joint_range: Float[Array, "3 2"]
+    link_inertia: Float[Array, "2"]
+    stand_height: Float[Array, ""]
 
 
 COMMAND_NAMES = ("v_x", "v_y", "yaw_rate", "height", "roll", "pitch")

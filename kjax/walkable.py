@@ -12,7 +12,8 @@ from kjax.config.gaits import gait_setting, reachable_gaits, setting_key
 from kjax.config.units import InSi, in_si
 from kjax.gait.reference import has_periodic_reference
 from kjax.legs.kinematics import REACH
-from kjax.rigid_body import nominal_feet, own_body
+from kjax.legs.posture import nominal_feet
+from kjax.rigid_body import own_body
 from kjax.types import COMMAND_NAMES, GRAVITY, Leg, Mode, RobotParams, contact_mode
 
 MARGIN = 1.2  # least impulse that the feet can give over a cycle, over the weight's

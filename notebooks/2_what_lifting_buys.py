@@ -24,11 +24,13 @@ from kjax.config import KoopmanConfig, SrbConfig  # noqa: E402
 from kjax.koopman import edmd, families, observables, validate  # noqa: E402
 from kjax.koopman.dataset import ranges_from_config, sample  # noqa: E402
 from kjax.rigid_body import own_body  # noqa: E402
-from kjax.robots import go1  # noqa: E402
+from kjax.robots import get_robot  # noqa: E402
 from kjax.types import MODE_ALPHA, Mode  # noqa: E402
 
 DT, STEPS = 1e-3, 200
-body = jax.tree.map(lambda a: a[Mode.TROT], edmd.srb_params(own_body(SrbConfig(), go1.PARAMS)))
+body = jax.tree.map(
+    lambda a: a[Mode.TROT], edmd.srb_params(own_body(SrbConfig(), get_robot().params))
+)
 alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
 ranges = ranges_from_config(KoopmanConfig().dataset, vary_feet=False)
 data = jax.jit(lambda k: sample(k, body, alpha, ranges, rollouts=100, steps=100, dt=DT))(

@@ -25,7 +25,7 @@ from kjax.koopman import open_loop, whole_body  # noqa: E402
 from kjax.koopman.features import affine, clock_history  # noqa: E402
 from kjax.koopman.transitions import Episode, split, transitions  # noqa: E402
 from kjax.rigid_body import own_body  # noqa: E402
-from kjax.robots import go1  # noqa: E402
+from kjax.robots import get_robot  # noqa: E402
 from kjax.sim.batch_loop import BatchEngine  # noqa: E402
 
 DT, ROBOTS = 0.005, 12
@@ -75,10 +75,10 @@ episodes = [
 # scheduled feet, and no others, touch the ground.
 
 # %%
-data = transitions(episodes, dt=DT, sole=go1.FOOT_RADIUS)
+data = transitions(episodes, dt=DT, sole=float(get_robot().params.foot_radius))
 train, test = split(np.arange(ROBOTS), share=0.33)
 fitted, held = (data.rows(np.isin(data.episode, own)) for own in (train, test))
-config = own_body(SrbConfig(), go1.PARAMS)
+config = own_body(SrbConfig(), get_robot().params)
 body = srb.SrbParams(jnp.asarray(config.mass), jnp.asarray(config.inertia), jnp.zeros((2, 2)))
 models = {"affine": affine, "with clock and last force": clock_history}
 fits = {

@@ -20,7 +20,7 @@ from kjax import RunConfig, load_config
 from kjax.controller import build_controller
 from kjax.params import condense, with_params
 from kjax.resolve import resolve
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.scene import build_model
@@ -33,7 +33,7 @@ config = load_config(RunConfig, None, {"command.times": [0.0, 0.5], "command.v_x
 # `resolve` fits the Koopman models, `condense` builds the LMPC's tables: a second or two, once.
 
 # %%
-spec, params = resolve(config, go1.PARAMS)
+spec, params = resolve(config)
 controller, tables = build_controller(spec), condense(spec, params)
 plan, act = jax.jit(controller.plan), jax.jit(controller.act)
 
@@ -44,10 +44,12 @@ plan, act = jax.jit(controller.plan), jax.jit(controller.act)
 # (4, 3) in the order FR, FL, RR, RL.
 
 # %%
-model = build_model(config.sim, config.terrain)
-observe, actuator = build_observe(model, 5.0), find_addresses(model).actuator.reshape(-1)
+robot = get_robot(config.robot)
+model = build_model(robot, config.sim, config.terrain)
+observe, at = build_observe(robot, model, 5.0), find_addresses(robot, model)
+actuator = at.actuator.reshape(-1)
 data = mujoco.MjData(model)
-data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+data.qpos[:], data.qvel[:] = initial_state(config, model)
 mujoco.mj_forward(model, data)
 
 

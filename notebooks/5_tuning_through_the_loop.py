@@ -19,7 +19,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from kjax import RunConfig, load_config  # noqa: E402
-from kjax.robots import go1  # noqa: E402
+from kjax.robots import get_robot  # noqa: E402
 from kjax.tuning import loop, optimise, space  # noqa: E402
 
 config = load_config(RunConfig, "configs/bound_velocity_short.toml", {"duration": 1.2})
@@ -86,7 +86,8 @@ before, after = (
     jax.device_get(run(numbers.params(variables), scenario)) for variables in (bad, result.best)
 )
 print(
-    "cost of this scenario:", *(f"{float(loop.cost(go1.PARAMS, t)):.1f}" for t in (before, after))
+    "cost of this scenario:",
+    *(f"{float(loop.cost(get_robot().params, t)):.1f}" for t in (before, after)),
 )
 fig, axes = plt.subplots(2, 3, figsize=(11, 5), layout="constrained")
 curve, off = axes[:, 0]

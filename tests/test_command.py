@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kjax import Command, ConfigError, ControlLoop, RunConfig, build_controller, load_config
+from kjax.legs.posture import stand_pose
 from kjax.observation import standing
 from kjax.params import condense, with_params
 from kjax.resolve import build_command, resolve
@@ -64,7 +65,7 @@ def test_traced_code_tells_of_what_it_does_not_follow(resolved):
     spec, params = resolved
     controller, tables = build_controller(spec), condense(spec, params)
     plan = jax.jit(controller.plan)
-    observation = jax.tree.map(jnp.asarray, standing(jnp.asarray(go1.stand_pose(0.27)[1])))
+    observation = jax.tree.map(jnp.asarray, standing(jnp.asarray(stand_pose(go1.PARAMS, 0.27)[1])))
     state = controller.init(tables, observation)
     for column, name in enumerate(COMMAND_NAMES):
         asked = with_params(tables, command=tables.params.command.hold(**{name: 0.1}))
@@ -78,7 +79,7 @@ def test_the_height_follows_the_command_at_its_rate(resolved):
     spec, params = resolved
     controller, tables = build_controller(spec), condense(spec, params)
     plan = jax.jit(controller.plan)
-    observation = jax.tree.map(jnp.asarray, standing(jnp.asarray(go1.stand_pose(0.27)[1])))
+    observation = jax.tree.map(jnp.asarray, standing(jnp.asarray(stand_pose(go1.PARAMS, 0.27)[1])))
     tables = with_params(tables, command=tables.params.command.hold(height=-0.004))
     state, heights = controller.init(tables, observation), []
     for _ in range(6):
@@ -100,7 +101,7 @@ def test_a_command_of_the_same_shape_holds_at_all_times():
 
 def test_a_loop_takes_another_command_without_compiling(resolved):
     loop = ControlLoop(*resolved)
-    sample = standing(go1.stand_pose(0.27)[1])
+    sample = standing(stand_pose(go1.PARAMS, 0.27)[1])
     loop.step(sample, 0.0)
     compiled = []
 

@@ -11,6 +11,7 @@ import pytest
 from kjax import control_loop
 from kjax.control_loop import PERIOD_CALLS, ControlLoop
 from kjax.controller import Controller
+from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.types import JointCommand, Observation, RobotParams
 
@@ -43,7 +44,7 @@ class Stub:
 
 
 def sample(**changes):
-    height, joints = go1.stand_pose(0.27)
+    height, joints = stand_pose(go1.PARAMS, 0.27)
     values = {
         "base_pos": [0.0, 0.0, height],
         "base_quat": [1.0, 0.0, 0.0, 0.0],

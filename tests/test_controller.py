@@ -14,6 +14,7 @@ from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, LmpcConfig
 from kjax.config.gaits import LIBRARY
 from kjax.koopman import families, prediction, storage
 from kjax.legs.base import build_base
+from kjax.legs.posture import stand_pose
 from kjax.mpc.lmpc import solve_lmpc
 from kjax.params import condense, with_params
 from kjax.planning import reference_trajectory
@@ -39,7 +40,7 @@ STANCE = {
 
 
 def standing(dtype=float, com_height=HEIGHT, **changes):
-    height, joints = go1.stand_pose(com_height)
+    height, joints = stand_pose(go1.PARAMS, com_height)
     floats = {
         "base_pos": [0.0, 0.0, height],
         "base_quat": [1.0, 0.0, 0.0, 0.0],

@@ -9,6 +9,7 @@ import pytest
 
 from kjax import Observation, build_controller, load_config, qp
 from kjax.config import RunConfig
+from kjax.legs.posture import stand_pose
 from kjax.params import condense, with_params
 from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
@@ -38,7 +39,7 @@ def compiled(config):
 def disturbed(seed, *, planar=False, scale=1.0, dtype=float):
     """The standing robot, moving and tilted a little; in the sagittal plane only if ``planar``."""
     rng = np.random.default_rng(seed)
-    height, joints = go1.stand_pose(0.27)
+    height, joints = stand_pose(go1.PARAMS, 0.27)
     keep = np.array([0.0, 1.0, 0.0]) if planar else np.ones(3)
     slide = np.array([1.0, 0.0, 1.0]) if planar else np.ones(3)
     quat, turns = np.zeros(4), 0.1 * scale * rng.normal(size=3) * keep

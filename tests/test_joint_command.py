@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from kjax import RunConfig, build_controller, load_config
+from kjax.legs.posture import stand_pose
 from kjax.params import condense
 from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.types import Observation
 
-JOINTS = go1.stand_pose(0.27)[1]
+JOINTS = stand_pose(go1.PARAMS, 0.27)[1]
 
 
 def sample(rng, base):

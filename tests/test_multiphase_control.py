@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kjax import RunConfig, build_controller, load_config, qp
+from kjax.legs.posture import stand_pose
 from kjax.params import condense
 from kjax.resolve import controller_spec, resolve
 from kjax.robots import go1
@@ -35,7 +36,7 @@ def config(**changes):
 
 
 def standing(**changes):
-    height, joints = go1.stand_pose(0.26)
+    height, joints = stand_pose(go1.PARAMS, 0.26)
     floats = {
         "base_pos": [0.0, 0.0, height],
         "base_quat": [1.0, 0.0, 0.0, 0.0],

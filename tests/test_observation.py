@@ -12,6 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from kjax import Observation, build_controller, check_observation, load_config, qp
 from kjax.config import RunConfig
+from kjax.legs.posture import stand_pose
 from kjax.observation import SHAPES, cast, is_valid
 from kjax.params import condense, with_params
 from kjax.resolve import controller_spec, resolve
@@ -21,7 +22,7 @@ CONFIG = load_config(RunConfig, None, {"lmpc.horizon": 2, "koopman.order": 1})
 
 
 def standing(**changes):
-    height, joints = go1.stand_pose(0.27)
+    height, joints = stand_pose(go1.PARAMS, 0.27)
     values = {
         "base_pos": np.array([3.0, -1.0, height - 2.0]),
         "base_quat": np.array([np.cos(0.4), 0.0, 0.0, np.sin(0.4)]),
@@ -34,7 +35,7 @@ def standing(**changes):
     return Observation(**(values | changes))
 
 
-JOINTS = go1.stand_pose(0.27)[1]
+JOINTS = stand_pose(go1.PARAMS, 0.27)[1]
 FAULTS = {
     "quaternion of zeros": ({"base_quat": np.zeros(4)}, r"base_quat: .* wanted a unit quaternion"),
     "quaternion in x, y, z, w order": (

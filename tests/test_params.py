@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kjax import RunConfig, build_controller, condense, load_config, resolve
+from kjax.legs.posture import stand_pose
 from kjax.observation import standing
 from kjax.params import with_params
 from kjax.robots import go1
@@ -44,7 +45,7 @@ def test_a_plan_has_a_derivative_by_a_weight(both):
     """Against central differences; away from bounds the plan is smooth."""
     spec, params = both
     controller = build_controller(spec)
-    seen = standing(jnp.asarray(go1.stand_pose(0.27)[1]))._replace(
+    seen = standing(jnp.asarray(stand_pose(go1.PARAMS, 0.27)[1]))._replace(
         base_vel=jnp.array([0.1, 0.0, 0.0])
     )
 

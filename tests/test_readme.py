@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kjax.config import SimConfig
+from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim.observe import find_addresses
 from kjax.sim.scene import build_model
@@ -41,10 +42,10 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
     with_loop, command, bare = blocks(repository, "docs/your_own_loop.md", "python")
     assert blocks(repository, "README.md", "python") == [with_loop]
     floor = -0.27
-    model = build_model(SimConfig(floor=floor))
-    at = find_addresses(model)
+    model = build_model(go1.ROBOT, SimConfig(floor=floor))
+    at = find_addresses(go1.ROBOT, model)
     data = mujoco.MjData(model)
-    height, joints = go1.stand_pose(0.27)
+    height, joints = stand_pose(go1.PARAMS, 0.27)
     heights, calls = [], []
 
     def put_robot_back():

@@ -25,6 +25,8 @@ class RunConfig:
     """Simulated time [s]."""
     seed: int = 0
     """Seed of noise and initial state [-]."""
+    robot: str = "go1"
+    """Who walks: a robot of kjax.robots, or "module:NAME" for a Robot of one's own [-]."""
     command: CommandConfig = CommandConfig()
     """Velocity command."""
     srb: SrbConfig = SrbConfig()
@@ -88,6 +90,8 @@ class RunConfig:
 class FitStudyConfig:
     """The fit study of the paper's Fig. 3."""
 
+    robot: str = "go1"
+    """Whose numbers srb takes where it gives none [-]."""
     srb: SrbConfig = SrbConfig()
     """Single rigid body."""
     koopman: KoopmanConfig = KoopmanConfig()

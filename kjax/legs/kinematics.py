@@ -19,7 +19,7 @@ from kjax.types import Observation, RobotParams
 # the stretched leg: the first keeps clear of the folded knee's limit, the second of the singular
 # straight leg.
 REACH = (0.15, 0.985)
-KNEE_RANGE = (-2.80, -0.90)  # rad; the Go1's -2.818 .. -0.888 with a small margin
+SINGULAR = 0.0275  # Jacobian's determinant over the squared leg length; below it a leg is straight
 
 
 class LegTrig(NamedTuple):
@@ -77,7 +77,8 @@ def inverse(
     factor = jnp.sqrt(jnp.clip(square, low**2, high**2) / square)
     x, z = foot[:, 0] * factor, foot[:, 1] * factor
     cosine = (square * factor**2 - l1**2 - l2**2) / (2.0 * l1 * l2)
-    c2 = jnp.clip(cosine, jnp.cos(KNEE_RANGE[0]), jnp.cos(KNEE_RANGE[1]))
+    folded, straight = jnp.cos(robot.joint_range[2])
+    c2 = jnp.clip(cosine, folded, straight)
     s2 = -jnp.sqrt(1.0 - c2**2)
     # (x, z) = -Rot(q1) (k2, k1): read the angle off the rotated pair instead of two arctangents.
     k1, k2 = l1 + l2 * c2, l2 * s2
@@ -98,7 +99,8 @@ def joint_rates(
     """
     J = foot_jacobian(robot, trig)
     det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    safe = jnp.where(jnp.abs(det) > 5e-3, det, jnp.inf)
+    least = SINGULAR * (robot.thigh_length + robot.calf_length) ** 2
+    safe = jnp.where(jnp.abs(det) > least, det, jnp.inf)
     thigh = (J[:, 1, 1] * velocity[:, 0] - J[:, 0, 1] * velocity[:, 1]) / safe
     calf = (J[:, 0, 0] * velocity[:, 1] - J[:, 1, 0] * velocity[:, 0]) / safe
     return jnp.stack([thigh, calf], axis=-1)

@@ -21,8 +21,8 @@ from kjax.legs import kinematics
 from kjax.legs.kinematics import LegTrig, PlanarState
 from kjax.types import Observation, RobotParams
 
-ABDUCTION_RANGE = 0.85  # rad; the Go1's 0.863 with a small margin
-MIN_DEPTH = 0.05  # m; the foot stays this far below the abduction axis, in the leg's plane
+# Part of the leg's length that the foot stays below the abduction axis at least, in its plane.
+MIN_DEPTH = 0.1174
 
 
 class HipTrig(NamedTuple):
@@ -108,14 +108,15 @@ def inverse(
     """
     x, y, z = foot[:, 0], foot[:, 1], foot[:, 2]
     d = robot.abduction_offset
-    depth = -jnp.sqrt(jnp.maximum(y * y + z * z - d * d, MIN_DEPTH**2))
+    least = _min_depth(robot)
+    depth = -jnp.sqrt(jnp.maximum(y * y + z * z - d * d, least**2))
     # (y, z) = Rot(q0) (d, depth); depth is not zero, and a target on the axis means q0 = 0.
     sine, cosine = z * d - y * depth, y * d + z * depth
     on_axis = y * y + z * z < 1e-12
     angle = jnp.arctan2(jnp.where(on_axis, 0.0, sine), jnp.where(on_axis, 1.0, cosine))
-    angle = jnp.clip(angle, -ABDUCTION_RANGE, ABDUCTION_RANGE)
+    angle = jnp.clip(angle, *robot.joint_range[0])
     hip = HipTrig(s0=jnp.sin(angle), c0=jnp.cos(angle))
-    below = jnp.minimum(-hip.s0 * y + hip.c0 * z, -MIN_DEPTH)
+    below = jnp.minimum(-hip.s0 * y + hip.c0 * z, -least)
     thigh, calf, trig = kinematics.inverse(robot, jnp.stack([x, below], axis=-1))
     return jnp.stack([angle, thigh, calf], axis=-1), hip, trig
 
@@ -129,7 +130,7 @@ def joint_rates(
     """
     v = about_x(HipTrig(s0=-hip.s0, c0=hip.c0), velocity)  # in the leg's plane
     depth = kinematics.foot_position(robot, trig)[:, 1]
-    rate = -v[:, 1] / jnp.where(jnp.abs(depth) > 0.5 * MIN_DEPTH, depth, jnp.inf)
+    rate = -v[:, 1] / jnp.where(jnp.abs(depth) > 0.5 * _min_depth(robot), depth, jnp.inf)
     up = v[:, 2] - robot.abduction_offset * rate
     planar = kinematics.joint_rates(robot, trig, jnp.stack([v[:, 0], up], axis=-1))
     return jnp.concatenate([rate[:, None], planar], axis=-1)
@@ -236,6 +237,10 @@ def _heading(rotation: Float[Array, "3 3"]) -> Float[Array, "2"]:
     vertical = square < 1e-12  # not for NaN, which shall stay
     ahead = jnp.stack([jnp.ones_like(square), jnp.zeros_like(square)])
     return jnp.where(vertical, ahead, nose / jnp.sqrt(jnp.where(vertical, 1.0, square)))
+
+
+def _min_depth(robot: RobotParams) -> Array:
+    return MIN_DEPTH * (robot.thigh_length + robot.calf_length)
 
 
 def _in_leg_plane(robot: RobotParams, foot: Float[Array, "4 2"]) -> Float[Array, "4 3"]:

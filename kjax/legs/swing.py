@@ -10,7 +10,7 @@ from kjax.legs.contact import Flags
 from kjax.legs.kinematics import PlanarState, inverse, joint_rates
 from kjax.types import RobotParams
 
-MAX_JOINT_RATE = 20.0  # rad/s; below the Go1's 30, bounds the reference near singular legs
+MAX_JOINT_RATE = 20.0  # rad/s; bounds the reference near singular legs
 
 
 class SwingParams(NamedTuple):

@@ -1,4 +1,4 @@
-"""Unitree Go1: constants, nominal stance, and where its MJCF lies.
+"""Unitree Go1: constants, and where its MJCF lies.
 
 Source of the figures: Unitree's go1_description URDF, as carried by MuJoCo Menagerie's
 ``unitree_go1``; ``tests/robots`` compares every one of them with the compiled model. This module
@@ -12,11 +12,10 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Array
 
+from kjax.robots.robot import Robot
 from kjax.types import RobotParams
 
 MJCF: Traversable = files("kjax.robots") / "go1.xml"
-
-JOINTS = ("abduction", "thigh", "calf")
 
 THIGH_LENGTH = 0.213  # m, hip to knee
 CALF_LENGTH = 0.213  # m, knee to foot centre
@@ -27,10 +26,7 @@ _LEFT = np.array([-1.0, 1.0, -1.0, 1.0])
 
 _TRUNK_MASS = 5.204  # kg
 _LINK_MASS = np.array([0.68, 1.009, 0.195862])  # kg: hip, thigh, calf
-LINK_INERTIA = (
-    0.004689,
-    0.001498,
-)  # kg m^2: thigh and calf about their centres of mass, pitch axis
+_LINK_INERTIA = (0.004689, 0.001498)  # kg m^2: thigh and calf, pitch axis
 
 
 def _link_com() -> np.ndarray:
@@ -48,7 +44,7 @@ def _f(values: Any) -> Array:
 
 PARAMS = RobotParams(
     mass=_f(_TRUNK_MASS + 4 * _LINK_MASS.sum()),  # 12.743 kg
-    # Composite inertia of all links about the common centre of mass, in ``stand_pose(0.27)``.
+    # Composite inertia of all links about the common centre of mass, in the nominal stance.
     pitch_inertia=_f(0.394350),
     trunk_mass=_f(_TRUNK_MASS),
     trunk_com=_f([0.0223, 0.002, -0.0005]),
@@ -60,46 +56,10 @@ PARAMS = RobotParams(
     calf_length=_f(CALF_LENGTH),
     foot_radius=_f(FOOT_RADIUS),
     torque_limit=_f([23.7, 23.7, 35.55]),
+    # Inside the MJCF's 0.863, -0.686 .. 4.501 and -2.818 .. -0.888 by a small margin.
+    joint_range=_f([[-0.85, 0.85], [-0.67, 4.48], [-2.80, -0.90]]),
+    link_inertia=_f(_LINK_INERTIA),
+    stand_height=_f(0.27),
 )
 
-
-def stand_pose(com_height: float) -> tuple[float, np.ndarray]:
-    """Trunk height [m] and joint angles (4, 3) [rad] that stand with feet below the hips.
-
-    Args:
-      com_height: height of the whole-body centre of mass above flat ground [m].
-
-    Raises:
-      ValueError: if the legs are too short or too long for that height.
-    """
-    l1, l2 = THIGH_LENGTH, CALF_LENGTH
-    trunk_height = com_height
-    for _ in range(50):  # the legs' share of the centre of mass moves little: contracts fast
-        drop = trunk_height - FOOT_RADIUS
-        cosine = (drop**2 - l1**2 - l2**2) / (2 * l1 * l2)
-        if not (drop > 0 and -0.942 < cosine < 0.622):  # knee within -2.80 .. -0.90 rad
-            raise ValueError(f"com_height must be about 0.10 to 0.37 m, got {com_height}")
-        calf = -np.arccos(cosine)
-        thigh = -np.arctan2(l2 * np.sin(calf), l1 + l2 * np.cos(calf))
-        offset = _com_height_in_trunk(thigh, calf)
-        if abs(com_height - offset - trunk_height) < 1e-12:
-            break
-        trunk_height = com_height - offset
-    return trunk_height, np.tile([0.0, thigh, calf], (4, 1))
-
-
-def _com_height_in_trunk(thigh: float, calf: float) -> float:
-    """Height of the whole-body centre of mass above the trunk frame, all legs alike [m]."""
-    hip_com, thigh_com, calf_com = (_link_com()[:, i] for i in range(3))
-    total = thigh + calf
-    z_thigh = -np.sin(thigh) * thigh_com[:, 0] + np.cos(thigh) * thigh_com[:, 2]
-    z_calf = (
-        -THIGH_LENGTH * np.cos(thigh)
-        - np.sin(total) * calf_com[:, 0]
-        + np.cos(total) * calf_com[:, 2]
-    )
-    m_hip, m_thigh, m_calf = _LINK_MASS
-    moment = _TRUNK_MASS * PARAMS.trunk_com[2] + np.sum(
-        m_hip * hip_com[:, 2] + m_thigh * z_thigh + m_calf * z_calf
-    )
-    return float(moment / PARAMS.mass)
+ROBOT = Robot(name="go1", params=PARAMS, mjcf=MJCF)

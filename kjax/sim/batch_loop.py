@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from copy import copy
+from dataclasses import fields
 from threading import Event
 from typing import Any, Literal, NamedTuple
 
@@ -24,9 +25,9 @@ import numpy as np
 
 from kjax.config import RunConfig
 from kjax.params import Tables
+from kjax.robots import get_robot
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import find_addresses
-from kjax.sim.push import pushed_body
 from kjax.sim.recording import Recording, empty_log
 from kjax.sim.resolve import (
     BatchSpec,
@@ -37,7 +38,7 @@ from kjax.sim.resolve import (
     stack_episodes,
     stack_tables,
 )
-from kjax.sim.scene import build_model, dress
+from kjax.sim.scene import apply_scene, build_model
 from kjax.sim.walk import Sensed, TickLog, WalkState, build_walk
 
 Torques = Literal["every_step", "held"]
@@ -96,10 +97,9 @@ class BatchEngine:
             raise ValueError(f"threads must be at least 1, got {threads}")
         self.spec, self.torques, self.dtype = batch_spec(config), torques, np.dtype(dtype)
         self.threads = _cores() if threads is None else threads
-        self.model = build_model(config.sim, config.terrain, visual=False)
-        self._walk = build_walk(
-            self.spec, self.model, find_addresses(self.model).actuator, held=torques == "held"
-        )
+        robot = get_robot(config.robot)
+        self.model = build_model(robot, config.sim, config.terrain, visual=False)
+        self._walk = build_walk(robot, self.spec, self.model, held=torques == "held")
         self._calls: dict[Any, Calls] = {}
 
     def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
@@ -202,18 +202,18 @@ class _Group:
         self._unit = self._per_tick if torques == "held" else per_act
         self.ticks = ticks_of(config)
         self.done = 0
-        models = dressed(model, configs)
+        models, at = scene_models(model, configs), find_addresses(get_robot(config.robot), model)
         self._batch = mujoco.batch.Batch(models[0], nsim=count, nthread=1)
         if any(one is not models[0] for one in models):
             self._batch.set_models(models)
         bind = self._batch.bind
         self._qpos, self._qvel = bind("qpos"), bind("qvel")
         self._sensordata, self._ctrl = bind("sensordata"), bind("ctrl")
-        self._pushes = bind("xfrc_applied")[:, pushed_body(model), :3]
+        self._pushes = bind("xfrc_applied")[:, at.trunk, :3]
         for i, one in enumerate(configs):
-            self._qpos[i], self._qvel[i] = initial_state(one, model.nq, model.nv)
+            self._qpos[i], self._qvel[i] = initial_state(one, model)
         self._batch.forward()
-        self._legs = find_addresses(model).actuator.reshape(-1)
+        self._legs, self._sign = at.actuator.reshape(-1), at.sign.reshape(-1)
         self._pushed = bool((episode.push_steps > 0).any())
         # Torques on their way to the joints, a ring of as many as the longest delay.
         self._ring = np.zeros((1 + int(episode.delay.max()) // self._unit, count, model.nu))
@@ -258,7 +258,9 @@ class _Group:
             if not series:
                 series = self._arrays(host)
             for array, value in zip(
-                series, (self._qpos, self._qvel, torque[:, self._legs], *host), strict=True
+                series,
+                (self._qpos, self._qvel, self._sign * torque[:, self._legs], *host),
+                strict=True,
             ):
                 array[tick] = value
             still = np.asarray(state.alive)
@@ -340,8 +342,9 @@ def ticks_of(config: RunConfig) -> int:
     return -(-round(config.duration / config.sim.sim_dt) // per_tick)
 
 
-def dressed(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.MjModel]:
+def scene_models(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.MjModel]:
     """A copy of the scene for each config's terrain, floor, friction, payload; equal ones once."""
+    robot = get_robot(configs[0].robot)
     made: dict[Any, mujoco.MjModel] = {}
     out = []
     for config in configs:
@@ -349,7 +352,7 @@ def dressed(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.
         key = (config.terrain, sim.friction, sim.payload, sim.start, sim.heading, sim.floor)
         if key not in made:
             made[key] = copy(model)
-            dress(made[key], config.sim, config.terrain)
+            apply_scene(robot, made[key], config.sim, config.terrain)
         out.append(made[key])
     return out
 
@@ -360,13 +363,26 @@ def require_one_batch(spec: BatchSpec, configs: Sequence[RunConfig], torques: st
         raise ValueError("configs must hold at least one config, got none")
     for i, config in enumerate(configs):
         if batch_spec(config) != spec:
-            raise ValueError(f"configs[{i}] belongs to another batch (see sim.resolve.batch_spec)")
+            raise ValueError(
+                f"configs[{i}] belongs to another batch: {_difference(batch_spec(config), spec)}"
+            )
         if config.duration != configs[0].duration:
             raise ValueError(
                 f"configs[{i}].duration is {config.duration} s, the first one's "
                 f"{configs[0].duration} s; one batch has one duration"
             )
         check_engine(config, torques=torques)
+
+
+def _difference(one: BatchSpec, first: BatchSpec) -> str:
+    """Where two specs differ."""
+    for part in ("scene", "controller"):
+        own, other = (getattr(spec, part) for spec in (one, first))
+        for entry in fields(own):
+            values = [getattr(spec, entry.name) for spec in (own, other)]
+            if values[0] != values[1]:
+                return f"{part}.{entry.name} is {values[0]!r}, the first one's {values[1]!r}"
+    return "it has another spec"
 
 
 def _rows(tables: Tables, axes: Any, rows: slice) -> Tables:

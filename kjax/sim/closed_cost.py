@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.sim.episode import reference_height
 from kjax.sim.recording import Recording
 from kjax.tuning.loop import CostWeights, Trace, cost
@@ -33,5 +33,5 @@ def recording_costs(
             status=log.status[:, robot],
             alive=np.arange(ticks) < recording.ticks[robot] - recording.fell[robot],
         )
-        out.append(float(cost(go1.PARAMS, trace, weights)))
+        out.append(float(cost(get_robot(config.robot).params, trace, weights)))
     return np.array(out)

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -17,14 +18,17 @@ from kjax.config import (
 from kjax.config.gaits import gait_setting
 from kjax.config.units import in_si
 from kjax.legs.base import build_base
+from kjax.legs.posture import stand_pose
 from kjax.resolve import build_command
-from kjax.robots import go1
+from kjax.robots import Robot, get_robot
 from kjax.sim import free_base
-from kjax.sim.observe import NOISE_DIM, Observe, noise_dim, noise_scale
-from kjax.types import COMMAND_NAMES
+from kjax.sim.observe import NOISE_DIM, Observe, find_addresses, noise_dim, noise_scale
+from kjax.sim.scene import robot_addresses
+from kjax.types import COMMAND_NAMES, RobotParams
 from kjax.walkable import build_gaits
 
-FALL_HEIGHT = 0.12  # m, centre of mass; about the trunk lying on the ground
+# Height of the centre of mass over the leg's length; about the trunk lying on the ground.
+FALL_HEIGHT = 0.28
 FALL_TILT = 1.0  # rad, pitch or roll
 SETTLE_TIME = 0.5  # s; metrics leave out the start from standing
 LATE_TIME = 2.0  # s after the last change of command, for what should be steady by then
@@ -114,35 +118,43 @@ def reference_height(
       time: (N,) since the start [s].
       config: of the run.
     """
-    si = in_si(config, go1.PARAMS)
+    si = in_si(config, get_robot(config.robot).params)
     heights = [gait_setting(si, one.name, "body_height") for one in build_gaits(config)]
     command = build_command(config.command)
     piece = np.searchsorted(command.times, time + 1e-9, side="right") - 1
     return np.array(heights)[gait] + command.values[piece, COMMAND_NAMES.index("height")]
 
 
-def initial_state(config: RunConfig, nq: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
-    """Qpos and qvel of the robot, standing, disturbed as the config and its seed say."""
-    si = in_si(config, go1.PARAMS)
-    height, joints = go1.stand_pose(gait_setting(si, config.gait.names[0], "body_height"))
-    qpos, qvel = np.zeros(15), np.zeros(15)
-    qpos[1], qpos[3:] = height, joints.reshape(-1)
+def initial_state(config: RunConfig, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Qpos (nq,), qvel (nv,) of the robot, standing, disturbed as the config and its seed say."""
+    robot = get_robot(config.robot)
+    si = in_si(config, robot.params)
+    height, joints = stand_pose(
+        robot.params, float(gait_setting(si, config.gait.names[0], "body_height"))
+    )
+    pose, rates = np.zeros(3), np.zeros(3)
+    pose[1] = height
     spread, noise = config.noise, np.random.default_rng([config.seed, 0])
     if spread.enabled:
         pitch = spread.initial_pitch * noise.standard_normal()
-        qpos[2] = -pitch
+        pose[2] = -pitch
         # Keep the lower pair of feet on the ground rather than in it.
-        qpos[1] += abs(np.sin(pitch)) * go1.PARAMS.hip_pos[0, 0]
-        qvel[:2] = spread.initial_velocity * noise.standard_normal(2)
-        qvel[2] = -spread.initial_pitch_rate * noise.standard_normal()
+        pose[1] += abs(np.sin(pitch)) * robot.params.hip_pos[0, 0]
+        rates[:2] = spread.initial_velocity * noise.standard_normal(2)
+        rates[2] = -spread.initial_pitch_rate * noise.standard_normal()
     if config.sim.base == "free":
-        qpos, qvel = free_base.from_planar(qpos, qvel)
-        free_base.turn(qpos, qvel, config.sim.heading)
-        qpos[:3] += [*config.sim.start, config.sim.floor]
+        pose, rates = free_base.from_planar(pose, rates)
+        free_base.turn(pose, rates, config.sim.heading)
+        pose[:3] += [*config.sim.start, config.sim.floor]
     else:
-        qpos[:2] += [config.sim.start[0], config.sim.floor]
-    if (len(qpos), len(qvel)) != (nq, nv):
-        raise ValueError(f"sim.base = '{config.sim.base}' has no model of nq {nq} and nv {nv}")
+        pose[:2] += [config.sim.start[0], config.sim.floor]
+    qpos, qvel = np.zeros(model.nq), np.zeros(model.nv)
+    if (len(pose) + 12, len(rates) + 12) != (model.nq, model.nv):
+        raise ValueError(
+            f"sim.base = '{config.sim.base}' has no model of nq {model.nq} and nv {model.nv}"
+        )
+    qpos[: len(pose)], qvel[: len(rates)] = pose, rates
+    find_addresses(robot, model).set_joints(qpos, joints)
     return qpos, qvel
 
 
@@ -183,13 +195,18 @@ def origin(sim: SimConfig) -> np.ndarray:
 
 
 def sagittal(
-    observe: Observe, qpos: np.ndarray, qvel: np.ndarray, start: np.ndarray | None = None
+    robot: RobotParams,
+    observe: Observe,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """True SRB states (N, 6) and feet (N, 4, 2) along a trajectory, without noise.
 
     Of a free base: in the plane of its heading, with the progress along the heading at the start.
 
     Args:
+      robot: geometry and masses.
       observe: of the model.
       qpos: (N, nq) positions.
       qvel: (N, nv) velocities.
@@ -202,16 +219,17 @@ def sagittal(
     def one(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
         seen = observe(qpos, qvel, jnp.zeros(64))
         seen = seen._replace(base_pos=seen.base_pos - zero)
-        body = base.view(go1.PARAMS, track, seen).planar
+        body = base.view(robot, track, seen).planar
         return body.x, body.feet
 
     x, feet = jax.jit(jax.vmap(one))(qpos, qvel)
     return np.asarray(x), np.asarray(feet)
 
 
-def fallen(height: float, pitch: float, roll: float = 0.0) -> bool:
+def fallen(robot: RobotParams, height: float, pitch: float, roll: float = 0.0) -> bool:
     """Whether a centre-of-mass height [m], pitch and roll [rad] mean a fall; NaN does."""
-    return not (height > FALL_HEIGHT and abs(pitch) < FALL_TILT and abs(roll) < FALL_TILT)
+    least = FALL_HEIGHT * (robot.thigh_length + robot.calf_length)
+    return not (height > least and abs(pitch) < FALL_TILT and abs(roll) < FALL_TILT)
 
 
 def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
@@ -228,7 +246,7 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
     error = run.x[steady, 3] - run.velocity_command[steady]
     pitch = np.degrees(np.abs(run.x[steady, 2]))
     height = run.x[steady, 1]
-    limit = go1.PARAMS.torque_limit
+    limit = get_robot(config.robot).params.torque_limit
     saturated = np.abs(run.torque) >= 0.999 * limit
     joints = saturated.any(axis=1).mean(axis=0)
     unsolved = run.plan_status != qp.Status.SOLVED
@@ -244,7 +262,7 @@ def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
         **_crossing(run, config),
         **_switching(run, config),
         **free_base.metrics(run.qpos, steady),
-        "foot_slip_m": foot_slip(run, run.dt, config.sim.contact_threshold),
+        "foot_slip_m": foot_slip(run, get_robot(config.robot), config.sim.contact_threshold),
         "torque_max_nm": float(np.abs(run.torque).max()),
         "torque_saturation_fraction": float(saturated.any(axis=(1, 2)).mean()),
         **{
@@ -358,18 +376,23 @@ def _switching(run: Trajectory, config: RunConfig) -> dict[str, Any]:
     }
 
 
-def foot_slip(run: Trajectory, dt: float, threshold: float) -> float:
+def foot_slip(run: Trajectory, robot: Robot, threshold: float) -> float:
     """Mean path that a foot's contact point slides along the ground per stance [m].
 
     The foot is a sphere: while the calf turns, its centre moves without slip. What counts is the
     velocity of the material point at the bottom, v_centre - (d angle / dt) * radius.
     """
-    if free_base.is_free(run.qpos):
-        slide = dt * free_base.sliding_speed(run.qpos, run.qvel)[:-1]
+    free = free_base.is_free(run.qpos)
+    at = robot_addresses(robot, "free" if free else "planar")
+    joints = at.joint_pos(run.qpos)
+    if free:
+        rates, quat = at.joint_vel(run.qvel), run.qpos[:, 3:7]
+        speed = free_base.sliding_speed(robot.params, quat, run.qvel[:, :6], joints, rates)
+        slide = run.dt * speed[:-1]
     else:
-        joints = run.qpos[:, 3:].reshape(-1, 4, 3)
         angle = run.qpos[:, 2, None] + joints[:, :, 1] + joints[:, :, 2]  # of the calf, about +y
-        slide = np.diff(run.feet[:, :, 0], axis=0) - go1.FOOT_RADIUS * np.diff(angle, axis=0)
+        rolled = robot.params.foot_radius * np.diff(angle, axis=0)
+        slide = np.diff(run.feet[:, :, 0], axis=0) - rolled
     touching = run.foot_force > threshold
     pressed = touching[:-1] & touching[1:]
     stances = np.sum(np.diff(run.stance.astype(int), axis=0) > 0) + run.stance[0].sum()

@@ -5,11 +5,18 @@ velocity in the world (3,) [m/s], angular velocity in the body (3,) [rad/s], joi
 qpos of the planar base: x, z [m], MuJoCo's angle about +y [rad], joints.
 """
 
+from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
+from scipy.spatial.transform import Rotation
 
-from kjax.robots import go1
+from kjax.legs import spatial
+from kjax.legs.kinematics import leg_trig
+from kjax.types import RobotParams
 
 _FREE_NQ = 19
 
@@ -19,19 +26,19 @@ def is_free(qpos: np.ndarray) -> bool:
     return qpos.shape[-1] == _FREE_NQ
 
 
-def from_planar(qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Qpos (19,) and qvel (18,) of the free robot in the state of a planar one."""
-    half = 0.5 * qpos[2]
-    pose = [qpos[0], 0.0, qpos[1], np.cos(half), 0.0, np.sin(half), 0.0]
-    return np.r_[pose, qpos[3:]], np.r_[qvel[0], 0.0, qvel[1], 0.0, qvel[2], 0.0, qvel[3:]]
+def from_planar(pose: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose (7,) and velocity (6,) of a free trunk in the state of a planar one, (3,) each."""
+    half = 0.5 * pose[2]
+    free = np.array([pose[0], 0.0, pose[1], np.cos(half), 0.0, np.sin(half), 0.0])
+    return free, np.array([rates[0], 0.0, rates[1], 0.0, rates[2], 0.0])
 
 
 def turn(qpos: np.ndarray, qvel: np.ndarray, yaw: float) -> None:
-    """Turn a free robot about the world's vertical through the origin, in place.
+    """Turn a free trunk about the world's vertical through the origin, in place.
 
     Args:
-      qpos: (19,) positions.
-      qvel: (18,) velocities; the angular one is in the body and stays.
+      qpos: (7,) pose.
+      qvel: (6,) velocities; the angular one is in the body and stays.
       yaw: to the left [rad].
     """
     c, s = np.cos(yaw), np.sin(yaw)
@@ -52,15 +59,12 @@ def attitude(qpos: np.ndarray) -> tuple[Any, Any, Any]:
     if not is_free(qpos):
         zero = np.zeros(qpos.shape[:-1])
         return zero, -qpos[..., 2], zero
-    R = _rotation(qpos[..., 3:7])
+    w, x, y, z = np.moveaxis(qpos[..., 3:7], -1, 0)
+    R = Rotation.from_quat(np.stack([x, y, z, w], axis=-1).reshape(-1, 4)).as_matrix()
+    R = R.reshape(*qpos.shape[:-1], 3, 3)
     roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
     pitch = np.arctan2(R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
     return roll, pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])
-
-
-def joints(qpos: np.ndarray) -> np.ndarray:
-    """Joint angles (..., 4, 3) [rad] of either base."""
-    return qpos[..., -12:].reshape(*qpos.shape[:-1], 4, 3)
 
 
 def metrics(qpos: np.ndarray, steady: np.ndarray) -> dict[str, float]:
@@ -83,49 +87,42 @@ def metrics(qpos: np.ndarray, steady: np.ndarray) -> dict[str, float]:
     }
 
 
-def sliding_speed(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+def sliding_speed(
+    robot: RobotParams,
+    quat: np.ndarray,
+    velocity: np.ndarray,
+    joints: np.ndarray,
+    rates: np.ndarray,
+) -> np.ndarray:
     """Horizontal speed (N, 4) of the material point at the bottom of each foot [m/s].
 
     Args:
-      qpos: (N, 19) of a free base.
-      qvel: (N, 18).
+      robot: geometry.
+      quat: (N, 4) attitude of the trunk, (w, x, y, z).
+      velocity: (N, 6) of the trunk: along the world's axes [m/s], about its own [rad/s].
+      joints: (N, 4, 3) angles [rad].
+      rates: (N, 4, 3) their rates [rad/s].
     """
-    R, q, rate = _rotation(qpos[:, 3:7]), joints(qpos), qvel[:, 6:].reshape(-1, 4, 3)
-    side = np.asarray(go1.PARAMS.abduction_offset)
-    # Joint by joint down the leg: axis and place in the trunk's axes, then v += rate axis x lever.
-    s0, c0 = np.sin(q[..., 0]), np.cos(q[..., 0])
-    zero, one = np.zeros_like(s0), np.ones_like(s0)
-    roll_axis = np.stack([one, zero, zero], axis=-1)
-    pitch_axis = np.stack([zero, c0, s0], axis=-1)
-    down = np.stack([zero, s0, -c0], axis=-1)  # of the leg's plane
-
-    def link(angle: np.ndarray, length: float) -> np.ndarray:
-        along = -np.sin(angle)[..., None] * roll_axis + np.cos(angle)[..., None] * down
-        return length * along
-
-    thigh = side[:, None] * pitch_axis
-    knee = thigh + link(q[..., 1], go1.THIGH_LENGTH)
-    foot = knee + link(q[..., 1] + q[..., 2], go1.CALF_LENGTH)
-    # The bottom of the sphere: straight down in the world.
-    bottom = foot - go1.FOOT_RADIUS * R[:, None, 2, :]
-    hips = np.asarray(go1.PARAMS.hip_pos)
-    velocity = np.cross(qvel[:, None, 3:6], hips + bottom)
-    for axis, origin, joint in (
-        (roll_axis, zero[..., None], 0),
-        (pitch_axis, thigh, 1),
-        (pitch_axis, knee, 2),
-    ):
-        velocity += rate[..., joint, None] * np.cross(axis, bottom - origin)
-    world = qvel[:, None, :3] + np.einsum("nij,nlj->nli", R, velocity)
-    return np.hypot(world[..., 0], world[..., 1])
+    with jax.enable_x64(True):
+        return np.asarray(_sliding_speed(robot, quat, velocity, joints, rates))
 
 
-def _rotation(quat: np.ndarray) -> np.ndarray:
-    """R_world_body (..., 3, 3) of quaternions (..., 4) as (w, x, y, z)."""
-    w, x, y, z = np.moveaxis(quat / np.linalg.norm(quat, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0, 0, 0))
+def _sliding_speed(
+    robot: RobotParams, quat: Array, velocity: Array, joints: Array, rates: Array
+) -> Array:
+    hip, trig = spatial.hip_trig(joints), leg_trig(joints)
+    R_world_body, omega = spatial.rotation_matrix(quat), velocity[3:]
+    foot = robot.hip_pos + spatial.foot_position(robot, hip, trig)
+    J = spatial.foot_jacobian(robot, hip, trig)
+    centre = jnp.cross(omega, foot) + jnp.einsum("lij,lj->li", J, rates)
+    # The calf turns with the trunk, about the abduction axis, and twice about the leg's own.
+    zero, one = jnp.zeros(4), jnp.ones(4)
+    roll_axis = jnp.stack([one, zero, zero], axis=-1)
+    pitch_axis = jnp.stack([zero, hip.c0, hip.s0], axis=-1)
+    bend = rates[:, 1] + rates[:, 2]
+    omega_calf = omega + rates[:, :1] * roll_axis + bend[:, None] * pitch_axis
+    bottom = -robot.foot_radius * R_world_body[2]  # straight down in the world
+    world = velocity[:3] + (centre + jnp.cross(omega_calf, bottom)) @ R_world_body.T
+    return jnp.hypot(world[:, 0], world[:, 1])

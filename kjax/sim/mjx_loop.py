@@ -18,17 +18,17 @@ from jaxtyping import Array, Float
 
 from kjax.config import RunConfig
 from kjax.params import Tables
+from kjax.robots import get_robot
 from kjax.sim.batch_loop import (
     OnProgress,
     Torques,
-    dressed,
     require_one_batch,
+    scene_models,
     ticks_of,
 )
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses
-from kjax.sim.push import pushed_body
 from kjax.sim.recording import Recording
 from kjax.sim.resolve import (
     EpisodeParams,
@@ -66,7 +66,7 @@ class MjxState(NamedTuple):
 def build_model(config: RunConfig) -> mujoco.MjModel:
     """The scene with the options that MJX needs: few solver iterations, feet-only contacts."""
     check_engine(config, engine="mjx")
-    spec = build_spec(config.sim, config.terrain, visual=False)
+    spec = build_spec(get_robot(config.robot), config.sim, config.terrain, visual=False)
     spec.option.iterations = 6
     spec.option.ls_iterations = 8
     return spec.compile()
@@ -108,9 +108,9 @@ class MjxEngine:
         self.traces = 0
         self._mjx = self._cast(mjx.put_model(self.model, impl=impl))
         self._impl = impl
-        self._walk = build_walk(
-            self.spec, self.model, find_addresses(self.model).actuator, held=torques == "held"
-        )
+        robot = get_robot(config.robot)
+        self._at = find_addresses(robot, self.model)
+        self._walk = build_walk(robot, self.spec, self.model, held=torques == "held")
         self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
         per_act = round(config.leg.act_dt / config.sim.sim_dt)
         # Physics steps that share a torque.
@@ -127,7 +127,7 @@ class MjxEngine:
         """
         require_one_batch(self.spec, configs, self.torques)
         tables, axes = stack_tables(configs, self.dtype)
-        models = dressed(self.model, configs)
+        models = scene_models(self.model, configs)
         episode, (own, own_axes) = stack_episodes(configs), self._differences(models)
         sensed, warm = self._start(configs, models)
         delays = 1 + int(episode.delay.max()) // self._unit
@@ -156,7 +156,7 @@ class MjxEngine:
         record = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
         alive = np.asarray(record.alive)
         fell = ~alive[-1]
-        legs = find_addresses(self.model).actuator.reshape(-1)
+        legs, sign = self._at.actuator.reshape(-1), self._at.sign.reshape(-1)
         return Recording(
             configs=list(configs),
             dt=self.spec.controller.control_dt,
@@ -164,7 +164,7 @@ class MjxEngine:
             fell=fell,
             qpos=record.qpos,
             qvel=record.qvel,
-            torque=record.torque[..., legs],
+            torque=sign * record.torque[..., legs],
             log=record.log,
             wall_time=time.perf_counter() - begin,
             interrupted=interrupted,
@@ -177,7 +177,7 @@ class MjxEngine:
         rows = []
         for config, model in zip(configs, models, strict=True):
             data = mujoco.MjData(model)
-            data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+            data.qpos[:], data.qvel[:] = initial_state(config, model)
             mujoco.mj_forward(model, data)
             rows.append((data.qpos, data.qvel, data.sensordata, data.qacc_warmstart))
         *sensed, warm = (jnp.asarray(np.stack(a), self.dtype) for a in zip(*rows, strict=True))
@@ -246,7 +246,7 @@ class MjxEngine:
         self, tables: Tables, own: dict[str, Array], episode: EpisodeParams, state: MjxState
     ) -> tuple[MjxState, MjxTick]:
         model, walk, unit = self._mjx.replace(**own), self._walk, self._unit
-        trunk = pushed_body(self.model)
+        trunk = self._at.trunk
 
         def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
             push = push_at(episode, step, xp=jnp).astype(self.dtype)
@@ -288,7 +288,7 @@ class MjxEngine:
         return jax.lax.scan(tick, state, None, length=_PIECE)
 
 
-# What ``scene.dress`` may change, with what follows from it.
+# What ``scene.apply_scene`` may change, with what follows from it.
 _MODEL_FIELDS = (
     "geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound", "geom_aabb",
     "body_mass", "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0",

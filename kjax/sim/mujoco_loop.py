@@ -18,7 +18,7 @@ from kjax.config import RunConfig
 from kjax.controller import Controller, build_controller
 from kjax.params import Tables, condense, with_params
 from kjax.resolve import build_command, controller_key, resolve
-from kjax.robots import go1
+from kjax.robots import Robot, get_robot
 from kjax.sim import free_base
 from kjax.sim.episode import (
     Trajectory,
@@ -30,9 +30,9 @@ from kjax.sim.episode import (
 )
 from kjax.sim.excitation import force_deviation, force_noise, perturb
 from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, find_addresses, noise_dim
-from kjax.sim.push import push_force, pushed_body
+from kjax.sim.push import push_force
 from kjax.sim.resolve import batch_spec
-from kjax.sim.scene import build_model, dress, foot_geoms
+from kjax.sim.scene import apply_scene, build_model
 from kjax.state import ControllerState
 from kjax.types import Command, Observation
 
@@ -94,6 +94,7 @@ class Simulation(NamedTuple):
 
     Attributes:
       config: it was built from.
+      robot: who walks.
       model: MuJoCo model.
       addresses: of joints, actuators, sensors.
       observe: (qpos, qvel, sensordata) -> observation.
@@ -106,6 +107,7 @@ class Simulation(NamedTuple):
     """
 
     config: RunConfig
+    robot: Robot
     model: mujoco.MjModel
     addresses: Addresses
     observe: Observe
@@ -131,9 +133,10 @@ def simulation_key(config: RunConfig) -> Hashable:
 
 def build_simulation(config: RunConfig) -> Simulation:
     """Model, controller and compiled calls for a config."""
-    model = build_model(config.sim, config.terrain)
-    observe = build_observe(model, config.sim.contact_threshold)
-    spec, params = resolve(config, go1.PARAMS)
+    robot = get_robot(config.robot)
+    model = build_model(robot, config.sim, config.terrain)
+    observe = build_observe(robot, model, config.sim.contact_threshold)
+    spec, params = resolve(config, robot.params)
     controller, tables = build_controller(spec), condense(spec, params)
     parts = (model.nq, model.nv, model.nsensordata, noise_dim(config.sim.base))
     cuts, size = np.cumsum(parts[:-1]), sum(parts)
@@ -202,8 +205,9 @@ def build_simulation(config: RunConfig) -> Simulation:
     _, log_like = jax.eval_shape(plan_log, state_like, example)
     simulation = Simulation(
         config=config,
+        robot=robot,
         model=model,
-        addresses=find_addresses(model),
+        addresses=find_addresses(robot, model),
         observe=observe,
         controller=controller,
         tables=tables,
@@ -278,10 +282,10 @@ def simulate(
     field = config.terrain
     if terrain_seed is not None:
         field = dataclasses.replace(field, seed=terrain_seed)
-    dress(model, config.sim, field)
-    soles = foot_geoms(model)
+    robot = simulation.robot
+    apply_scene(robot, model, config.sim, field)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+    data.qpos[:], data.qvel[:] = initial_state(config, model)
     mujoco.mj_forward(model, data)
 
     per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
@@ -308,12 +312,11 @@ def simulate(
     plan_time, act_time = np.zeros(ticks), np.zeros(steps)
     body_contact = np.zeros(ticks, bool)
     is_foot_or_world = model.geom_bodyid == 0
-    is_foot_or_world[soles] = True
+    is_foot_or_world[at.feet] = True
     delay = round(config.sim.delay / config.sim.sim_dt)
-    pushed = pushed_body(model)
     push = push_force(config.push, np.arange(steps) * config.sim.sim_dt, config.sim.sim_dt, np)
     logs: list[np.ndarray] = []
-    actuators, trunk = at.actuator.reshape(-1), model.body("trunk").id
+    actuators, sign, trunk = at.actuator.reshape(-1), at.sign.reshape(-1), at.trunk
 
     state = simulation.init(sense(0), requests(config))
 
@@ -341,13 +344,14 @@ def simulate(
                     state, command = simulation.act(state, sensed)
                     torque[i] = command
                     act_time[i] = time.perf_counter() - clock
-                data.ctrl[actuators] = torque[i - delay] if i >= delay else 0.0
-                data.xfrc_applied[pushed, :3] = push[i]
+                data.ctrl[actuators] = sign * torque[i - delay] if i >= delay else 0.0
+                data.xfrc_applied[trunk, :3] = push[i]
                 mujoco.mj_step(model, data)
                 done = i + 1
             body_contact[tick] = not is_foot_or_world[data.contact.geom].all()
             roll, pitch, _ = free_base.attitude(data.qpos)
-            if fallen(data.subtree_com[trunk, 2] - config.sim.floor, pitch, roll):
+            height = data.subtree_com[trunk, 2] - config.sim.floor
+            if fallen(robot.params, height, pitch, roll):
                 fell = True
                 break
             if on_tick is not None:
@@ -359,7 +363,7 @@ def simulate(
         raise KeyboardInterrupt  # nothing to keep
 
     keep = slice(0, done)
-    x, feet = sagittal(simulation.observe, qpos[keep], qvel[keep], origin(config.sim))
+    x, feet = sagittal(robot.params, simulation.observe, qpos[keep], qvel[keep], origin(config.sim))
     ticks_log = simulation.unpack_log(np.stack(logs))
     held = np.arange(done) // per_tick
     return Trajectory(

@@ -5,7 +5,7 @@ It reads ``qpos``, ``qvel`` and ``sensordata`` only, so the same function serves
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -13,33 +13,53 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.config import NoiseConfig
-from kjax.robots.go1 import JOINTS
-from kjax.types import Leg, Observation
+from kjax.robots import Robot
+from kjax.types import Observation
 
 Observe = Callable[[Array, Array, Array], Observation]
 
 
 class Addresses(NamedTuple):
-    """Where the model keeps what the controller needs, resolved by name.
+    """Where the model keeps what the controller needs, resolved by name, and how it counts.
 
     Attributes:
       qpos: (4, 3) position address of each joint, leg order.
       qvel: (4, 3) velocity address.
       actuator: (4, 3) actuator index.
       foot_force: (4,) address of each foot's touch sensor.
+      feet: (4,) geom of each foot.
+      trunk: body of the trunk.
+      sign: (4, 3) 1 or -1: our angle is sign times (the model's - zero), our torque sign times its.
+      zero: (4, 3) the model's angle where ours is 0 [rad].
     """
 
     qpos: np.ndarray
     qvel: np.ndarray
     actuator: np.ndarray
     foot_force: np.ndarray
+    feet: np.ndarray
+    trunk: int
+    sign: np.ndarray
+    zero: np.ndarray
+
+    def joint_pos(self, qpos: Any) -> Any:
+        """Our joint angles (..., 4, 3) of positions (..., nq) [rad]."""
+        return self.sign * (qpos[..., self.qpos] - self.zero)
+
+    def joint_vel(self, qvel: Any) -> Any:
+        """Our joint rates (..., 4, 3) of velocities (..., nv) [rad/s]."""
+        return self.sign * qvel[..., self.qvel]
+
+    def set_joints(self, qpos: np.ndarray, joint_pos: np.ndarray) -> None:
+        """Write our joint angles (4, 3) [rad] into positions (nq,)."""
+        qpos[self.qpos] = self.zero + self.sign * joint_pos
 
 
-def find_addresses(model: mujoco.MjModel) -> Addresses:
-    """Addresses of joints, actuators and sensors by name.
+def find_addresses(robot: Robot, model: mujoco.MjModel) -> Addresses:
+    """Addresses of a robot's trunk, joints, actuators, feet and sensors by name.
 
     Raises:
-      ValueError: naming the joint, actuator or sensor that the model lacks.
+      ValueError: naming the body, joint, actuator, geom or sensor that the model lacks.
     """
 
     def find(kind: mujoco.mjtObj, name: str) -> int:
@@ -48,26 +68,31 @@ def find_addresses(model: mujoco.MjModel) -> Addresses:
             raise ValueError(f"the model has no {kind.name.removeprefix('mjOBJ_')} named '{name}'")
         return index
 
-    names = [[f"{leg.name}_{joint}" for joint in JOINTS] for leg in Leg]
-    joints = np.array([[find(mujoco.mjtObj.mjOBJ_JOINT, n) for n in row] for row in names])
-    actuators = [[find(mujoco.mjtObj.mjOBJ_ACTUATOR, n) for n in row] for row in names]
-    sensors = [find(mujoco.mjtObj.mjOBJ_SENSOR, f"{leg.name}_foot") for leg in Leg]
+    kinds = mujoco.mjtObj
+    joints = np.array([[find(kinds.mjOBJ_JOINT, name) for name in row] for row in robot.joints])
+    motors = [[find(kinds.mjOBJ_ACTUATOR, name) for name in row] for row in robot.motors]
+    sensors = [find(kinds.mjOBJ_SENSOR, name) for name in robot.touch]
     return Addresses(
         qpos=model.jnt_qposadr[joints],
         qvel=model.jnt_dofadr[joints],
-        actuator=np.array(actuators),
+        actuator=np.array(motors),
         foot_force=model.sensor_adr[sensors],
+        feet=np.array([find(kinds.mjOBJ_GEOM, name) for name in robot.feet]),
+        trunk=find(kinds.mjOBJ_BODY, robot.trunk),
+        sign=robot.joint_sign,
+        zero=robot.joint_zero,
     )
 
 
-def build_observe(model: mujoco.MjModel, contact_threshold: float) -> Observe:
+def build_observe(robot: Robot, model: mujoco.MjModel, contact_threshold: float) -> Observe:
     """Function (qpos, qvel, sensordata) -> Observation for a model of either base.
 
     Args:
+      robot: in the model.
       model: from ``sim.scene``.
       contact_threshold: foot force above which a contact counts [N].
     """
-    at = find_addresses(model)
+    at = find_addresses(robot, model)
     is_free = model.nq == 19
 
     def observe_free(qpos: Array, qvel: Array, sensordata: Array) -> Observation:
@@ -76,8 +101,8 @@ def build_observe(model: mujoco.MjModel, contact_threshold: float) -> Observe:
             base_quat=qpos[3:7],
             base_vel=qvel[:3],
             base_ang_vel=qvel[3:6],
-            joint_pos=qpos[at.qpos],
-            joint_vel=qvel[at.qvel],
+            joint_pos=at.joint_pos(qpos),
+            joint_vel=at.joint_vel(qvel),
             contact=sensordata[at.foot_force] > contact_threshold,
         )
 
@@ -89,8 +114,8 @@ def build_observe(model: mujoco.MjModel, contact_threshold: float) -> Observe:
             base_quat=jnp.stack([jnp.cos(half), zero, jnp.sin(half), zero]),
             base_vel=jnp.stack([qvel[0], zero, qvel[1]]),
             base_ang_vel=jnp.stack([zero, qvel[2], zero]),
-            joint_pos=qpos[at.qpos],
-            joint_vel=qvel[at.qvel],
+            joint_pos=at.joint_pos(qpos),
+            joint_vel=at.joint_vel(qvel),
             contact=sensordata[at.foot_force] > contact_threshold,
         )
 

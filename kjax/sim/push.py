@@ -3,13 +3,10 @@
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.config import PushConfig
-
-BODY = "trunk"  # pushed at its centre of mass
 
 
 def push_force(
@@ -44,8 +41,3 @@ def impulses(config: PushConfig) -> tuple[tuple[float, ...], tuple[float, ...]]:
         return value if isinstance(value, tuple) else (value,) * count
 
     return each(config.forward), each(config.lateral)
-
-
-def pushed_body(model: mujoco.MjModel) -> int:
-    """Row of ``xfrc_applied`` that pushes go to."""
-    return model.body(BODY).id

@@ -19,7 +19,6 @@ from kjax.config import (
 )
 from kjax.params import Tables, condense
 from kjax.resolve import build_command, controller_key, controller_spec, resolve
-from kjax.robots import go1
 from kjax.sim.episode import origin
 from kjax.sim.excitation import force_deviation
 from kjax.sim.observe import noise_scale
@@ -57,6 +56,7 @@ class SceneSpec:
     """What shapes the program of a closed loop besides its controller.
 
     Attributes:
+      robot: who walks.
       base: "planar" or "free".
       sim_dt: physics step [s].
       cone: of the contact solver.
@@ -70,6 +70,7 @@ class SceneSpec:
       force_noise: whether planned forces are perturbed.
     """
 
+    robot: str
     base: str
     sim_dt: float
     cone: str
@@ -102,6 +103,7 @@ def resolve_scene(
     """
     sim, terrain, noise, push = config.sim, config.terrain, config.noise, config.push
     spec = SceneSpec(
+        robot=config.robot,
         base=sim.base,
         sim_dt=sim.sim_dt,
         cone=sim.cone,
@@ -180,7 +182,7 @@ def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]
     kinds = [controller_key(config) for config in configs]
     for kind, config in zip(kinds, configs, strict=True):
         if kind not in built:
-            spec, params = resolve(config, go1.PARAMS)
+            spec, params = resolve(config)
             built[kind] = jax.device_get(condense(spec, params, dtype=dtype))
     names = list(built)
     which = np.array([names.index(kind) for kind in kinds])

@@ -1,12 +1,15 @@
 """The scene: robot, base, ground and physics options, assembled with MjSpec."""
 
+from functools import lru_cache
+from typing import Literal
+
 import mujoco
 import numpy as np
 
 from kjax.config import SimConfig, TerrainConfig
-from kjax.robots import go1
+from kjax.robots import Robot
+from kjax.sim.observe import Addresses, find_addresses
 from kjax.sim.terrain import add_obstacles, generate, ground_level, moved, place
-from kjax.types import Leg
 
 _CONES = {
     "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
@@ -15,17 +18,18 @@ _CONES = {
 
 
 def build_spec(
-    config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
+    robot: Robot, config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
 ) -> mujoco.MjSpec:
-    """MjSpec of the Go1 on its ground, open to further edits before ``compile``.
+    """MjSpec of a robot on its ground, open to further edits before ``compile``.
 
     Args:
+      robot: who stands there.
       config: physics.
       terrain: obstacles; none if ``None``.
       visual: whether to make it fit to look at; textures are 97 % of the compiled model, which a
         batch holds once per robot.
     """
-    spec = mujoco.MjSpec.from_string(go1.MJCF.read_text(encoding="utf-8"))
+    spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
     spec.option.timestep = config.sim_dt
     spec.option.cone = _CONES[config.cone]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -34,50 +38,51 @@ def build_spec(
         joint.damping[0] = config.joint_damping
         joint.armature = config.joint_armature
     for geom in spec.geoms:
-        is_foot = geom.name.endswith("_foot")
-        if is_foot:
+        if geom.name in robot.feet:
             geom.friction[0] = config.friction
         elif config.contacts == "feet":
             geom.contype, geom.conaffinity = 0, 0
-    _add_base(spec, config.base)
+    _add_base(spec, robot.trunk, config.base)
     level = 0.0 if terrain is None else ground_level(terrain)
     _add_ground(spec, config.floor + level, visual)
     if visual:
-        _add_looks(spec)
+        _add_looks(spec, robot.trunk)
     if terrain is not None:
         add_obstacles(spec, terrain, config)
     return spec
 
 
 def build_model(
-    config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
+    robot: Robot, config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
 ) -> mujoco.MjModel:
-    """Compiled model of the Go1 on its ground, flat by default."""
-    return build_spec(config, terrain, visual=visual).compile()
+    """Compiled model of a robot on its ground, flat by default."""
+    return build_spec(robot, config, terrain, visual=visual).compile()
 
 
-def dress(model: mujoco.MjModel, config: SimConfig, field: TerrainConfig) -> None:
+@lru_cache(maxsize=16)
+def robot_addresses(robot: Robot, base: Literal["planar", "free"]) -> Addresses:
+    """Where recorded positions of a robot on a base hold what, whatever the ground is."""
+    return find_addresses(robot, build_model(robot, SimConfig(base=base), visual=False))
+
+
+def apply_scene(
+    robot: Robot, model: mujoco.MjModel, config: SimConfig, field: TerrainConfig
+) -> None:
     """Give a compiled scene another config's obstacles, floor, friction and payload, in place.
 
     Raises:
       ValueError: for a field with another number of obstacles.
     """
-    trunk = model.body("trunk").id
-    model.body_mass[trunk] = go1.PARAMS.trunk_mass + config.payload
-    model.geom_friction[foot_geoms(model), 0] = config.friction
+    model.body_mass[model.body(robot.trunk).id] = robot.params.trunk_mass + config.payload
+    model.geom_friction[[model.geom(name).id for name in robot.feet], 0] = config.friction
     model.geom_pos[model.geom("ground").id, 2] = config.floor + ground_level(field)
     # Computes what follows from the mass as well.
     place(model, moved(generate(field, config.friction), config))
 
 
-def foot_geoms(model: mujoco.MjModel) -> list[int]:
-    """Geoms of the feet, leg order."""
-    return [model.geom(f"{leg.name}_foot").id for leg in Leg]
-
-
-def _add_base(spec: mujoco.MjSpec, base: str) -> None:
+def _add_base(spec: mujoco.MjSpec, body: str, base: str) -> None:
     """Joints of the trunk: two slides and a pitch hinge, or a free joint."""
-    trunk = spec.body("trunk")
+    trunk = spec.body(body)
     if base == "free":
         trunk.add_freejoint(name="root")
         return
@@ -105,7 +110,7 @@ def _add_ground(spec: mujoco.MjSpec, floor: float, visual: bool) -> None:
     )
 
 
-def _add_looks(spec: mujoco.MjSpec) -> None:
+def _add_looks(spec: mujoco.MjSpec, trunk: str) -> None:
     """Tiles, light, sky and a camera that follows the robot from its right side."""
     spec.add_texture(
         name="sky",
@@ -127,10 +132,10 @@ def _add_looks(spec: mujoco.MjSpec) -> None:
     )
     material = spec.add_material(name="ground", texrepeat=[4, 4], texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    spec.body("trunk").add_light(
+    spec.body(trunk).add_light(
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -0.6, 3], dir=[0, 0.2, -1]
     )
-    spec.body("trunk").add_camera(
+    spec.body(trunk).add_camera(
         name="side",
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
         pos=[0.15, -1.25, 0.22],

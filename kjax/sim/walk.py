@@ -17,12 +17,13 @@ from jaxtyping import Array, Bool, Float
 from kjax.controller import build_controller
 from kjax.legs.base import build_base
 from kjax.params import Tables
+from kjax.robots import Robot
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
 from kjax.sim.excitation import force_row, perturb
-from kjax.sim.observe import add_noise, build_observe
+from kjax.sim.observe import add_noise, build_observe, find_addresses
 from kjax.sim.resolve import BatchSpec, EpisodeParams
 from kjax.state import ControllerState
-from kjax.types import Observation
+from kjax.types import Observation, RobotParams
 
 
 class Sensed(NamedTuple):
@@ -83,24 +84,21 @@ class Walk(NamedTuple):
     act: Callable[[Tables, EpisodeParams, WalkState, Array, Sensed], tuple[WalkState, Array]]
 
 
-def build_walk(
-    spec: BatchSpec, model: mujoco.MjModel, actuators: np.ndarray, *, held: bool
-) -> Walk:
+def build_walk(robot: Robot, spec: BatchSpec, model: mujoco.MjModel, *, held: bool) -> Walk:
     """Functions for all robots with one spec.
 
     Args:
+      robot: theirs.
       spec: theirs.
       model: of the scene; its addresses count.
-      actuators: (4, 3) actuator of each joint, a permutation of all.
       held: whether ``act`` is called once per control tick rather than every ``leg.act_dt``.
     """
     # The swing legs move on by one of these times with each call of ``act``.
     own, scene = spec.controller, spec.scene
     controller = build_controller(replace(own, act_dt=own.control_dt) if held else own)
     base = build_base(own.base)
-    observe = build_observe(model, scene.contact_threshold)
-    touch = [model.sensor_adr[model.sensor(f"{leg}_foot").id] for leg in ("FR", "FL", "RR", "RL")]
-    order = np.argsort(actuators.reshape(-1))
+    observe, at = build_observe(robot, model, scene.contact_threshold), find_addresses(robot, model)
+    order = np.argsort(at.actuator.reshape(-1))
 
     def see(sensed: Sensed) -> Observation:
         return observe(
@@ -136,7 +134,7 @@ def build_walk(
         log = TickLog(
             x=body.x,
             feet=body.feet,
-            foot_force=sensed.sensordata[jnp.asarray(touch)],
+            foot_force=sensed.sensordata[jnp.asarray(at.foot_force)],
             gait=moved.clock.gait,
             stance=moved.stance,
             force=moved.force,
@@ -146,22 +144,25 @@ def build_walk(
             residual=info.residual,
             iterations=info.iterations,
         )
-        return WalkState(moved, state.track, state.alive & standing(body.x, true)), log
+        return WalkState(
+            moved, state.track, state.alive & standing(tables.params.robot, body.x, true)
+        ), log
 
     def act(
         tables: Tables, episode: EpisodeParams, state: WalkState, step: Array, sensed: Sensed
     ) -> tuple[WalkState, Array]:
         moved, command = controller.act(tables, state.controller, sense(episode, step, sensed))
         torque = jnp.where(state.alive, command.torque, 0.0)
-        return state._replace(controller=moved), torque.reshape(-1)[order]
+        return state._replace(controller=moved), (jnp.asarray(at.sign) * torque).reshape(-1)[order]
 
     return Walk(init=init, plan=plan, act=act)
 
 
-def standing(x: Float[Array, "6"], observation: Observation) -> Bool[Array, ""]:
+def standing(robot: RobotParams, x: Float[Array, "6"], observation: Observation) -> Bool[Array, ""]:
     """Whether the robot has not fallen; not a number is a fall (``episode.fallen``)."""
     w, i, j, k = observation.base_quat
     roll = jnp.arctan2(2.0 * (w * i + j * k), 1.0 - 2.0 * (i * i + j * j))
     finite = jnp.isfinite(observation.joint_pos).all() & jnp.isfinite(observation.joint_vel).all()
     upright = (jnp.abs(x[2]) < FALL_TILT) & (jnp.abs(roll) < FALL_TILT)
-    return finite & (x[1] > FALL_HEIGHT) & upright
+    least = FALL_HEIGHT * (robot.thigh_length + robot.calf_length)
+    return finite & (x[1] > least) & upright

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from kjax.config import AxisConfig, ConfigError, RunConfig, SweepConfig, load_config
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.sim.episode import metric_names
 from kjax.walkable import check_walkable
 
@@ -115,7 +115,7 @@ def _check_walkable(config: RunConfig, point: Mapping[str, Any], file: Path) -> 
     """Refuse a point before anything walks, not when its turn comes."""
     try:
         with warnings.catch_warnings(action="ignore"):  # each is told when its walk begins
-            check_walkable(config, go1.PARAMS)
+            check_walkable(config, get_robot(config.robot).params)
     except ValueError as error:
         where = ", ".join(f"{name} = {value}" for name, value in point.items())
         raise ConfigError(f"{file}: at {where}: {error}") from None

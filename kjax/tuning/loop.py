@@ -29,7 +29,7 @@ from kjax.params import ControllerParams, condense
 from kjax.reference import next_clock
 from kjax.resolve import controller_spec
 from kjax.rigid_body import body_numbers
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.state import ControllerState
 from kjax.tuning import plant as body_plant
 from kjax.tuning.plant import PlantParams
@@ -307,7 +307,7 @@ def draw_scenarios(
     inertia_error: float = 0.2,
     lag: float = 0.005,
     gain: tuple[float, float] = (0.85, 1.0),
-    robot: RobotParams = go1.PARAMS,
+    robot: RobotParams | None = None,
 ) -> Scenario:
     """Random scenarios (count, ...): commands, starts, masses, inertias, noise.
 
@@ -321,8 +321,9 @@ def draw_scenarios(
       inertia_error: largest relative error of the inertia [-].
       lag: longest lag of the forces [s].
       gain: range of the part of a planned force that arrives [-].
-      robot: whose plant it is.
+      robot: whose plant it is; that of the config if ``None``.
     """
+    robot = get_robot(config.robot).params if robot is None else robot
     rng = np.random.default_rng(seed)
     noise = config.noise if config.noise.enabled else _silent()
     height = gait_setting(in_si(config, robot), config.gait.names[0], "body_height")

@@ -22,7 +22,6 @@ from kjax.legs.kinematics import PlanarState, inverse, leg_trig, moving_moments,
 from kjax.legs.stance import stance_torque
 from kjax.legs.swing import joint_reference
 from kjax.observation import standing
-from kjax.robots import go1
 from kjax.types import RobotParams
 
 
@@ -60,7 +59,7 @@ def nominal_plant(
     friction: float = 0.8,
     lag: float = 0.0,
     gain: float = 1.0,
-    link_inertia: tuple[float, float] = go1.LINK_INERTIA,
+    link_inertia: tuple[float, float] | None = None,
     spin: float = 1.0,
 ) -> PlantParams:
     """The plant of a robot that stands: its centre of mass is that of the whole body.
@@ -72,9 +71,11 @@ def nominal_plant(
       friction: of the ground [-].
       lag: of the forces [s].
       gain: of the forces [-].
-      link_inertia: of a thigh and a calf about their centres of mass [kg m^2].
+      link_inertia: of a thigh and a calf about their centres of mass, the robot's if ``None``
+        [kg m^2].
       spin: part of the legs' angular momentum that counts [-].
     """
+    own = robot.link_inertia if link_inertia is None else link_inertia
     return PlantParams(
         mass=jnp.asarray(mass, float),
         inertia=jnp.asarray(inertia, float),
@@ -82,7 +83,7 @@ def nominal_plant(
         friction=jnp.asarray(friction, float),
         lag=jnp.asarray(lag, float),
         gain=jnp.asarray(gain, float),
-        link_inertia=jnp.asarray(link_inertia, float),
+        link_inertia=jnp.asarray(own, float),
         spin=jnp.asarray(spin, float),
     )
 

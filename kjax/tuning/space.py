@@ -19,7 +19,7 @@ from kjax.koopman.families import BodyModel
 from kjax.params import ControllerParams, Fits, cast
 from kjax.resolve import fit_models, gather
 from kjax.rigid_body import body_numbers
-from kjax.robots import go1
+from kjax.robots import get_robot
 from kjax.types import RobotParams
 
 Variables = dict[str, Array]  # by key
@@ -52,7 +52,7 @@ def build_space(
     config: RunConfig,
     keys: Sequence[str],
     *,
-    robot: RobotParams = go1.PARAMS,
+    robot: RobotParams | None = None,
     fits: Fits | None = None,
 ) -> Space:
     """Variables for some keys of a config.
@@ -63,12 +63,13 @@ def build_space(
     Args:
       config: that all other numbers come from.
       keys: of ``TUNABLE``.
-      robot: whose controller it is.
+      robot: whose controller it is; that of the config if ``None``.
       fits: models; those of the config if ``None``.
 
     Raises:
       ValueError: for a key that is no variable, or one whose number has no logarithm.
     """
+    robot = get_robot(config.robot).params if robot is None else robot
     kinds = tunable(RunConfig, config.gaits)
     if not keys:
         raise ValueError("keys must name at least one variable, got none")

@@ -11,11 +11,10 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from kjax.config import RunConfig
-from kjax.robots.go1 import JOINTS
 from kjax.sim import free_base
 from kjax.sim.episode import Trajectory, reference_height
 from kjax.sim.series import Series
-from kjax.types import Leg
+from kjax.types import JOINT_NAMES, Leg
 from kjax.walkable import build_gaits
 
 BLUE, RED, GREY, DARK = "#2b6cb0", "#c53030", "#a0aec0", "#2d3748"
@@ -77,7 +76,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         start, stop = zoom_window(t[-1], config)
         part = (t >= start) & (t <= stop)
         _forces(force, run, part)
-        for joint, name in enumerate(JOINTS):
+        for joint, name in enumerate(JOINT_NAMES):
             peak = np.abs(run.torque[part, :, joint]).max(axis=1)
             torque.plot(t[part], peak, color=(GREY, BLUE, RED)[joint], label=name)
         torque.set_ylabel("largest |torque|\nof the legs [N m]")

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from kjax.config import RunConfig, load_config
-from kjax.robots import go1
-from kjax.sim import free_base
+from kjax.robots import get_robot
 from kjax.sim.episode import Trajectory
 from kjax.types import Leg
 
@@ -49,7 +49,7 @@ def save_video(trajectory_file: Path, config_file: Path, path: Path) -> str:
             return f"rendered with MuJoCo ({backend})"
         last = (child.stderr.strip().splitlines() or ["no message"])[-1]
         failures.append(f"{backend}: {last[:120]}")
-    stick_video(Trajectory.load(trajectory_file), path)
+    stick_video(Trajectory.load(trajectory_file), load_config(RunConfig, config_file), path)
     return "no GL library loads (" + "; ".join(failures) + "): drew a stick animation"
 
 
@@ -59,7 +59,7 @@ def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
 
     from kjax.sim.scene import build_model
 
-    model = build_model(config.sim, config.terrain)
+    model = build_model(get_robot(config.robot), config.sim, config.terrain)
     data = mujoco.MjData(model)
     renderer = mujoco.Renderer(model, height=SIZE[1], width=SIZE[0])
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
@@ -72,8 +72,9 @@ def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
     renderer.close()
 
 
-def stick_video(run: Trajectory, path: Path) -> None:
+def stick_video(run: Trajectory, config: RunConfig, path: Path) -> None:
     """Draw a run as a side view of lines: trunk, legs, ground, obstacles of the path left out."""
+    sticks = _build_sticks(config)
     scale, ground = 620.0, 300.0  # pixels per metre; row of z = 0
     with _writer(path) as writer:
         for i in _frames(run):
@@ -87,7 +88,7 @@ def stick_video(run: Trajectory, path: Path) -> None:
             for tick in np.arange(np.floor(run.qpos[i, 0]) - 1, run.qpos[i, 0] + 2, 0.1):
                 x, _ = at(np.array([tick, 0.0]))
                 draw.line([(x, ground), (x - 5, ground + 8)], fill="#a0aec0")
-            trunk, legs = _sticks(run.qpos[i])
+            trunk, legs = sticks(run.qpos[i])
             for leg, colour in zip(
                 (1, 3, 0, 2), ("#90cdf4", "#9ae6b4", "#c53030", "#dd6b20"), strict=True
             ):
@@ -98,23 +99,28 @@ def stick_video(run: Trajectory, path: Path) -> None:
             writer.append_data(_captioned(np.asarray(image), run, i))
 
 
-def _sticks(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Trunk ends (2, 2) and hip, knee, foot of each leg (4, 3, 2), world (x, z) [m].
+def _build_sticks(config: RunConfig) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Function qpos -> trunk ends (2, 2) and hip, knee, foot of each leg (4, 3, 2), (x, z) [m]."""
+    import mujoco
 
-    Roll, yaw and abduction of a free robot are left out.
-    """
-    _, pitch, _ = free_base.attitude(qpos)
-    rotation = np.array([[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]])
-    origin = qpos[:3:2] if free_base.is_free(qpos) else qpos[:2]
-    hips = np.asarray(go1.PARAMS.hip_pos)[:, ::2]
-    joints = free_base.joints(qpos)
-    down = -np.stack([np.sin(joints[:, 1]), np.cos(joints[:, 1])], axis=-1)
-    total = joints[:, 1] + joints[:, 2]
-    knees = hips + go1.THIGH_LENGTH * down
-    feet = knees - go1.CALF_LENGTH * np.stack([np.sin(total), np.cos(total)], axis=-1)
-    legs = np.stack([hips, knees, feet], axis=1) @ rotation.T + origin
-    trunk = np.array([[0.24, 0.0], [-0.22, 0.0]]) @ rotation.T + origin
-    return trunk, legs
+    from kjax.sim.observe import find_addresses
+    from kjax.sim.scene import build_model
+
+    robot = get_robot(config.robot)
+    model = build_model(robot, config.sim, visual=False)
+    data, at = mujoco.MjData(model), find_addresses(robot, model)
+    bodies = [[model.joint(name).bodyid[0] for name in row[1:]] for row in robot.joints]
+
+    def sticks(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        legs = np.concatenate([data.xpos[bodies], data.geom_xpos[at.feet][:, None]], axis=1)
+        ends = legs[:, 0].reshape(2, 2, 3).mean(axis=1)  # between the hips, front and rear
+        overhang = 0.12 * (ends[0] - ends[1])
+        trunk = np.stack([ends[0] + overhang, ends[1] - overhang])
+        return trunk[:, ::2], legs[..., ::2]
+
+    return sticks
 
 
 def _writer(path: Path) -> Any:

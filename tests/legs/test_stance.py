@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from kjax.legs.kinematics import leg_trig
+from kjax.legs.posture import stand_pose
 from kjax.legs.stance import stance_torque
 from kjax.robots import go1
 from kjax.types import Leg, RobotParams
@@ -56,7 +57,7 @@ def test_torques_balance_the_ground_reaction_in_mujoco(planar_go1, leg_joints, d
 
 def test_a_leg_that_pushes_up_on_the_robot_stretches_its_knee():
     """The knee points back (calf angle negative): an upward ground force wants it to fold."""
-    _, joint_pos = go1.stand_pose(0.27)
+    _, joint_pos = stand_pose(go1.PARAMS, 0.27)
     force = jnp.tile(jnp.array([0.0, 31.0]), (4, 1))
     torque = np.asarray(press(jnp.asarray(joint_pos), force))
     assert (torque[:, 1] > 0).all()

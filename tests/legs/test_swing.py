@@ -9,6 +9,7 @@ import pytest
 
 from kjax.legs import kinematics, swing
 from kjax.legs.contact import Flags, initial_contact
+from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.types import Leg, Observation, RobotParams
 
@@ -232,7 +233,7 @@ def test_before_the_first_swing_nothing_is_held_and_the_path_stays_at_the_feet()
 
 
 def standing(x=0.0, pitch=0.0, velocity=0.0, dtype="float64"):
-    height, joint_pos = go1.stand_pose(0.27)
+    height, joint_pos = stand_pose(go1.PARAMS, 0.27)
     half = -0.5 * pitch  # nose-up is a negative turn about +y
     values = (
         [x, 0.0, height],

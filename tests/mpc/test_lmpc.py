@@ -15,6 +15,7 @@ from kjax.config.gaits import LIBRARY
 from kjax.config.units import in_si
 from kjax.koopman import models, observables
 from kjax.legs.kinematics import LegTrig, leg_trig
+from kjax.legs.posture import stand_pose
 from kjax.mpc import lmpc
 from kjax.mpc.limits import force_limits
 from kjax.qp import Status
@@ -443,7 +444,7 @@ def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():
     pitch, mu = 0.4, 0.6
     c, s = np.cos(pitch), np.sin(pitch)
     R = np.array([[c, -s], [s, c]])  # nose up: body to world
-    posture = leg_trig(jnp.asarray(go1.stand_pose(0.27)[1]))
+    posture = leg_trig(jnp.asarray(stand_pose(go1.PARAMS, 0.27)[1]))
     rows = force_limits(
         go1.PARAMS, posture, jnp.asarray(R), jnp.ones(4, bool), friction=mu, torque_fraction=None
     )

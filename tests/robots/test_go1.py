@@ -1,6 +1,5 @@
 """Every constant of the Go1 against the compiled MJCF, and the nominal stance."""
 
-import dataclasses
 import re
 
 import mujoco
@@ -8,10 +7,10 @@ import numpy as np
 import pytest
 
 from kjax.config import LmpcConfig, SrbConfig
-from kjax.legs.kinematics import KNEE_RANGE
+from kjax.legs.posture import stand_pose
 from kjax.rigid_body import own_body
 from kjax.robots import go1
-from kjax.types import GRAVITY, Leg
+from kjax.types import GRAVITY, JOINT_NAMES, Leg
 
 LINKS = ("hip", "thigh", "calf")
 
@@ -26,7 +25,7 @@ def model():
 def standing(planar_go1, leg_joints):
     """MuJoCo in ``stand_pose(0.27)``."""
     data = mujoco.MjData(planar_go1)
-    height, joint_pos = go1.stand_pose(0.27)
+    height, joint_pos = stand_pose(go1.PARAMS, 0.27)
     data.joint("root_z").qpos = height
     data.qpos[planar_go1.jnt_qposadr[leg_joints]] = joint_pos
     mujoco.mj_forward(planar_go1, data)
@@ -76,7 +75,7 @@ def test_legs_are_named_by_where_they_are(model):
 
 def test_torque_limits_and_motors_are_those_of_the_model(model):
     for leg in Leg:
-        for joint, limit in zip(go1.JOINTS, go1.PARAMS.torque_limit, strict=True):
+        for joint, limit in zip(JOINT_NAMES, go1.PARAMS.torque_limit, strict=True):
             motor = model.actuator(f"{leg.name}_{joint}")
             np.testing.assert_array_equal(motor.ctrlrange, [-limit, limit])
             assert motor.trnid[0] == model.joint(f"{leg.name}_{joint}").id
@@ -90,14 +89,28 @@ def test_torque_limits_and_motors_are_those_of_the_model(model):
 def test_joints_turn_about_the_axes_that_the_kinematics_assume(model):
     axes = {"abduction": [1, 0, 0], "thigh": [0, 1, 0], "calf": [0, 1, 0]}
     for leg in Leg:
-        for joint in go1.JOINTS:
+        for joint in JOINT_NAMES:
             np.testing.assert_array_equal(model.joint(f"{leg.name}_{joint}").axis, axes[joint])
 
 
-def test_inverse_kinematics_stays_inside_the_knees_range(model):
+def test_joint_ranges_stay_inside_the_models(model):
     for leg in Leg:
-        low, high = model.joint(f"{leg.name}_calf").range
-        assert low < KNEE_RANGE[0] < KNEE_RANGE[1] < high
+        for joint, (low, high) in zip(JOINT_NAMES, go1.PARAMS.joint_range, strict=True):
+            least, most = model.joint(f"{leg.name}_{joint}").range
+            # Within the mechanical limits, by a small margin.
+            assert least < low < least + 0.025
+            assert most - 0.025 < high < most
+
+
+def test_link_inertias_are_those_of_the_model(model):
+    """About the pitch axis, with the leg's frame for the link's: the inertial axes are tilted."""
+    for leg in Leg:
+        for link, own in zip(("thigh", "calf"), go1.PARAMS.link_inertia, strict=True):
+            body = model.body(f"{leg.name}_{link}")
+            R = np.zeros(9)
+            mujoco.mju_quat2Mat(R, body.iquat)
+            R = R.reshape(3, 3)
+            assert (R @ np.diag(body.inertia) @ R.T)[1, 1] == pytest.approx(own, rel=2e-3)
 
 
 def test_the_composite_pitch_inertia_is_that_of_the_nominal_stance(planar_go1, standing):
@@ -124,7 +137,7 @@ def test_standing_puts_the_feet_on_the_ground_below_the_hips(planar_go1, standin
 @pytest.mark.parametrize("height", [0.13, 0.2, 0.27, 0.32, 0.37])
 def test_standing_has_the_centre_of_mass_at_the_height_asked_for(planar_go1, leg_joints, height):
     data = mujoco.MjData(planar_go1)
-    trunk_height, joint_pos = go1.stand_pose(height)
+    trunk_height, joint_pos = stand_pose(go1.PARAMS, height)
     data.joint("root_z").qpos = trunk_height
     data.qpos[planar_go1.jnt_qposadr[leg_joints]] = joint_pos
     mujoco.mj_forward(planar_go1, data)
@@ -140,16 +153,16 @@ def test_standing_has_the_centre_of_mass_at_the_height_asked_for(planar_go1, leg
 @pytest.mark.parametrize("height", [-0.1, 0.0, 0.05, 0.42, 1.0, float("nan")])
 def test_a_height_that_the_legs_cannot_reach_is_refused_by_name(height):
     with pytest.raises(ValueError, match="com_height"):
-        go1.stand_pose(height)
+        stand_pose(go1.PARAMS, height)
 
 
 def test_a_refused_height_is_told_the_range_that_works():
     with pytest.raises(ValueError, match="com_height") as refusal:
-        go1.stand_pose(1.0)
+        stand_pose(go1.PARAMS, 1.0)
     low, high = (float(n) for n in re.findall(r"0\.\d+", str(refusal.value))[:2])
     # The message gives centimetres and says "about": half of one.
-    go1.stand_pose(low + 0.005)
-    go1.stand_pose(high - 0.005)
+    stand_pose(go1.PARAMS, low + 0.005)
+    stand_pose(go1.PARAMS, high - 0.005)
 
 
 def test_the_default_rigid_body_is_the_go1():
@@ -176,8 +189,7 @@ def test_gravity_is_the_models(model):
 
 
 def test_the_robot_can_stand_at_the_default_height_within_its_torque_limits():
-    heights = {field.name: field.default for field in dataclasses.fields(LmpcConfig)}
-    _, joints = go1.stand_pose(heights["height"])
+    _, joints = stand_pose(go1.PARAMS, 0.426 * LmpcConfig().body_height)
     # Feet lie below the hips: the lever of a quarter of the weight is the knee's way back.
     knee = go1.PARAMS.mass * GRAVITY / 4 * go1.THIGH_LENGTH * np.sin(joints[0, 1])
     assert 0.0 < knee < 0.5 * go1.PARAMS.torque_limit[2]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, load_config
-from kjax.sim.batch_loop import BatchEngine, dressed
+from kjax.robots import go1
+from kjax.sim.batch_loop import BatchEngine, scene_models
 from kjax.sim.episode import initial_state, metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
 from kjax.sim.observe import find_addresses
@@ -62,11 +63,11 @@ def held_recording(held, configs):
 
 def test_physics_is_that_of_single_robots_to_the_last_bit(held, held_recording, configs):
     """Held torques are recorded whole, so a plain loop over ``mj_step`` can repeat them."""
-    actuators = find_addresses(held.model).actuator.reshape(-1)
+    actuators = find_addresses(go1.ROBOT, held.model).actuator.reshape(-1)
     for i, config in enumerate(configs):
-        (model,) = dressed(held.model, [config])
+        (model,) = scene_models(held.model, [config])
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+        data.qpos[:], data.qvel[:] = initial_state(config, model)
         mujoco.mj_forward(model, data)
         trunk = model.body("trunk").id
         delay = round(config.sim.delay / 0.005)
@@ -127,8 +128,8 @@ def test_numbers_that_are_none_end_one_robot_only(held, held_recording, configs,
     """A state that is not a number, from the first tick on, is a fall."""
     from kjax.sim import batch_loop
 
-    def start(config, nq, nv):
-        qpos, qvel = initial_state(config, nq, nv)
+    def start(config, model):
+        qpos, qvel = initial_state(config, model)
         return (qpos * np.nan if config.seed == 1 else qpos), qvel
 
     monkeypatch.setattr(batch_loop, "initial_state", start)

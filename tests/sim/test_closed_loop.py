@@ -107,11 +107,11 @@ def test_a_fall_ends_the_run_and_is_reported(simulation):
 
 
 def test_fallen_includes_nan():
-    assert fallen(np.nan, 0.0)
-    assert fallen(0.27, np.nan)
-    assert fallen(0.05, 0.0)
-    assert fallen(0.27, 1.2)
-    assert not fallen(0.27, 0.1)
+    assert fallen(go1.PARAMS, np.nan, 0.0)
+    assert fallen(go1.PARAMS, 0.27, np.nan)
+    assert fallen(go1.PARAMS, 0.05, 0.0)
+    assert fallen(go1.PARAMS, 0.27, 1.2)
+    assert not fallen(go1.PARAMS, 0.27, 0.1)
 
 
 def test_a_trajectory_survives_saving(run, tmp_path):
@@ -136,7 +136,7 @@ def test_the_robot_starts_on_its_feet():
     config = load_config(RunConfig, None, {"sim.base": "planar", "noise.enabled": False})
     simulation = build_simulation(config)
     data = mujoco.MjData(simulation.model)
-    data.qpos[:], data.qvel[:] = initial_state(config, simulation.model.nq, simulation.model.nv)
+    data.qpos[:], data.qvel[:] = initial_state(config, simulation.model)
     mujoco.mj_forward(simulation.model, data)
     feet = [data.geom(f"{leg}_foot").xpos[2] for leg in ("FR", "FL", "RR", "RL")]
     np.testing.assert_allclose(feet, go1.FOOT_RADIUS, atol=1e-9)
@@ -161,9 +161,9 @@ def test_slip_of_a_rolling_foot_is_zero_and_of_a_dragged_one_its_path():
             **{**empty, "qpos": qpos, "feet": feet, "foot_force": force, "stance": stance}
         )
 
-    assert foot_slip(made(go1.FOOT_RADIUS * angle), 1e-3, 5.0) == pytest.approx(0.0, abs=1e-12)
+    assert foot_slip(made(go1.FOOT_RADIUS * angle), go1.ROBOT, 5.0) == pytest.approx(0.0, abs=1e-12)
     dragged = made(go1.FOOT_RADIUS * angle + np.linspace(0, 0.01, steps))
-    assert foot_slip(dragged, 1e-3, 5.0) == pytest.approx(0.01, abs=1e-12)
+    assert foot_slip(dragged, go1.ROBOT, 5.0) == pytest.approx(0.01, abs=1e-12)
 
 
 IN_PLACE = {"sim.base": "planar", "command.times": [0.0], "command.v_x": [0.0]}

@@ -2,17 +2,21 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, SimConfig
+from kjax.robots import go1
 from kjax.sim.contacts import body_contact
 from kjax.sim.episode import initial_state
+from kjax.sim.observe import find_addresses
 from kjax.sim.scene import build_model
 
 
 @pytest.mark.parametrize(("base", "height"), [("planar", 1), ("free", 2)])
 def test_a_standing_robot_touches_with_its_feet_only_and_a_lowered_one_with_its_body(base, height):
     config = RunConfig(sim=SimConfig(base=base))
-    model = build_model(config.sim, visual=False)
-    qpos, _ = initial_state(config, model.nq, model.nv)
+    model = build_model(go1.ROBOT, config.sim, visual=False)
+    qpos, _ = initial_state(config, model)
     rows = np.repeat(qpos[None], 3, axis=0)
     rows[1, height] = 0.04  # below the trunk's half-height
     rows[2, height] = 1.0
-    np.testing.assert_array_equal(body_contact(model, rows), [False, True, False])
+    np.testing.assert_array_equal(
+        body_contact(model, find_addresses(go1.ROBOT, model), rows), [False, True, False]
+    )

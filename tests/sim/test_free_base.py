@@ -7,12 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from kjax.config import RunConfig, load_config
+from kjax.config import RunConfig, SimConfig, load_config
+from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim import free_base, mjx_loop
 from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics, sensor_noise
 from kjax.sim.mujoco_loop import build_simulation, simulate
 from kjax.sim.observe import FREE_NOISE_DIM, add_noise, build_observe
+from kjax.sim.scene import build_model
 
 FREE = {"sim.base": "free", "sim.contacts": "feet"}
 PER_TICK, TICKS = 5, 60
@@ -40,16 +42,19 @@ def moved(model, seed):
     data = mujoco.MjData(model)
     data.qpos[:3] = [0.3, -0.2, 0.4]
     mujoco.mju_euler2Quat(data.qpos[3:7], rng.uniform(-0.5, 0.5, 3), "zyx")
-    data.qpos[7:] = (go1.stand_pose(0.27)[1] + 0.3 * rng.standard_normal((4, 3))).reshape(-1)
+    data.qpos[7:] = (stand_pose(go1.PARAMS, 0.27)[1] + 0.3 * rng.standard_normal((4, 3))).reshape(
+        -1
+    )
     data.qvel[:] = rng.standard_normal(18)
     mujoco.mj_forward(model, data)
     return data
 
 
 def test_it_starts_in_the_planar_robot_s_state(config, model):
-    qpos, qvel = initial_state(config, 19, 18)
+    qpos, qvel = initial_state(config, model)
     planar = dataclasses.replace(config, sim=dataclasses.replace(config.sim, base="planar"))
-    flat, flat_vel = initial_state(planar, 15, 15)
+    flat_model = build_model(go1.ROBOT, planar.sim, visual=False)
+    flat, flat_vel = initial_state(planar, flat_model)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = qpos, qvel
     mujoco.mj_forward(model, data)
@@ -62,7 +67,7 @@ def test_it_starts_in_the_planar_robot_s_state(config, model):
     # The lower pair stands on the ground, as on the planar base.
     assert min(feet) == pytest.approx(go1.FOOT_RADIUS, abs=0.002)
     with pytest.raises(ValueError, match="nq 15"):
-        initial_state(config, 15, 15)
+        initial_state(config, build_model(go1.ROBOT, SimConfig(base="planar"), visual=False))
 
 
 def test_the_attitude_is_mujocos(model):
@@ -81,7 +86,13 @@ def test_the_attitude_is_mujocos(model):
 def test_the_sole_slides_at_mujocos_speed_of_that_point(model):
     for seed in range(3):
         data = moved(model, seed)
-        ours = free_base.sliding_speed(data.qpos[None], data.qvel[None])[0]
+        ours = free_base.sliding_speed(
+            go1.PARAMS,
+            data.qpos[None, 3:7],
+            data.qvel[None, :6],
+            data.qpos[None, 7:].reshape(1, 4, 3),
+            data.qvel[None, 6:].reshape(1, 4, 3),
+        )[0]
         for leg, name in enumerate(("FR", "FL", "RR", "RL")):
             sole = data.geom(f"{name}_foot").xpos - [0.0, 0.0, go1.FOOT_RADIUS]
             J = np.zeros((3, model.nv))
@@ -90,7 +101,7 @@ def test_the_sole_slides_at_mujocos_speed_of_that_point(model):
 
 
 def test_noise_of_the_trunk_is_three_dimensional(model):
-    observe = build_observe(model, 5.0)
+    observe = build_observe(go1.ROBOT, model, 5.0)
     data = moved(model, 0)
     clean = observe(*(jnp.asarray(a) for a in (data.qpos, data.qvel, data.sensordata)))
     same = add_noise(clean, jnp.zeros(FREE_NOISE_DIM))
@@ -122,9 +133,9 @@ def test_the_sagittal_noise_is_the_planar_robot_s(config):
 
 
 def test_a_roll_is_a_fall():
-    assert fallen(0.27, 0.0, 1.1)
-    assert fallen(0.27, 0.0, np.nan)
-    assert not fallen(0.27, 0.1, -0.9)
+    assert fallen(go1.PARAMS, 0.27, 0.0, 1.1)
+    assert fallen(go1.PARAMS, 0.27, 0.0, np.nan)
+    assert not fallen(go1.PARAMS, 0.27, 0.1, -0.9)
 
 
 def test_metrics_measure_yaw_and_drift_from_the_first_heading():
@@ -177,7 +188,7 @@ def test_its_feet_plant_and_contacts_follow_the_schedule(shoved, config):
     agreement = (shoved.foot_force[late] > 5.0) == shoved.stance[late]
     # touchdown is a few ms early or late in each phase of 250 ms; the shove costs some more
     assert agreement.mean() > 0.93
-    assert 0.0 < foot_slip(shoved, config.sim.sim_dt, 5.0) < 0.01
+    assert 0.0 < foot_slip(shoved, go1.ROBOT, 5.0) < 0.01
 
 
 def test_the_same_drag_is_the_same_slip_on_both_bases():
@@ -189,9 +200,9 @@ def test_the_same_drag_is_the_same_slip_on_both_bases():
     run |= {"foot_force": force, "stance": stance}
     qpos, qvel = np.zeros((steps, 19)), np.zeros((steps, 18))
     qpos[:, 3], qvel[:, 0] = 1.0, 0.1
-    assert foot_slip(Trajectory(**run | {"qpos": qpos, "qvel": qvel}), 1e-3, 5.0) == pytest.approx(
-        0.01, abs=1e-12
-    )
+    assert foot_slip(
+        Trajectory(**run | {"dt": 1e-3, "qpos": qpos, "qvel": qvel}), go1.ROBOT, 5.0
+    ) == pytest.approx(0.01, abs=1e-12)
 
 
 @pytest.mark.slow

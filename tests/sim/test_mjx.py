@@ -9,6 +9,7 @@ import pytest
 from mujoco.mjx._src import math as mjx_math
 
 from kjax import RunConfig, load_config
+from kjax.robots import go1
 from kjax.sim import mjx_loop
 from kjax.sim.batch_loop import BatchEngine
 
@@ -47,7 +48,7 @@ def engine(configs):
     """
 
     def converging(config):
-        spec = mjx_loop.build_spec(config.sim, config.terrain, visual=False)
+        spec = mjx_loop.build_spec(go1.ROBOT, config.sim, config.terrain, visual=False)
         spec.option.iterations = spec.option.ls_iterations = 50
         spec.option.tolerance, spec.option.ls_tolerance = 1e-15, 1e-6
         return spec.compile()

@@ -5,24 +5,25 @@ import pytest
 
 from kjax.config import NoiseConfig, SimConfig
 from kjax.legs.kinematics import planar_state
+from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim.observe import NOISE_DIM, add_noise, build_observe, find_addresses, noise_scale
 from kjax.sim.scene import build_model, build_spec
-from kjax.types import Leg
+from kjax.types import JOINT_NAMES, Leg
 
 
 @pytest.fixture(scope="module")
 def model():
-    return build_model(SimConfig(base="planar"))
+    return build_model(go1.ROBOT, SimConfig(base="planar"))
 
 
 @pytest.fixture(scope="module")
 def data(model):
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
-    height, joints = go1.stand_pose(0.27)
+    height, joints = stand_pose(go1.PARAMS, 0.27)
     data.qpos[1], data.qpos[3:] = height, joints.reshape(-1)
-    free = find_addresses(model).qpos[:, 1:].reshape(-1)
+    free = find_addresses(go1.ROBOT, model).qpos[:, 1:].reshape(-1)
     data.qpos[free] += 0.2 * rng.standard_normal(8)
     data.qpos[:3] += 0.2 * rng.standard_normal(3)
     data.qvel[:3] = rng.standard_normal(3)
@@ -33,7 +34,7 @@ def data(model):
 
 
 def observed(model, data):
-    return build_observe(model, 5.0)(
+    return build_observe(go1.ROBOT, model, 5.0)(
         jnp.asarray(data.qpos), jnp.asarray(data.qvel), jnp.asarray(data.sensordata)
     )
 
@@ -63,23 +64,23 @@ def test_feet_are_where_mujoco_has_them(model, data):
 def test_joints_are_found_by_name_whatever_the_order_of_the_legs(model, data):
     observation = observed(model, data)
     for leg in Leg:
-        for j, joint in enumerate(go1.JOINTS):
+        for j, joint in enumerate(JOINT_NAMES):
             name = f"{leg.name}_{joint}"
             assert float(observation.joint_pos[leg, j]) == data.joint(name).qpos[0]
             assert float(observation.joint_vel[leg, j]) == data.joint(name).qvel[0]
-            assert model.actuator(find_addresses(model).actuator[leg, j]).name == name
+            assert model.actuator(find_addresses(go1.ROBOT, model).actuator[leg, j]).name == name
 
 
 def test_a_model_without_a_leg_is_refused_by_name():
-    spec = build_spec(SimConfig())
+    spec = build_spec(go1.ROBOT, SimConfig())
     spec.joint("FL_calf").name = "something"
     spec.actuator("FL_calf").target = "something"
     with pytest.raises(ValueError, match="FL_calf"):
-        find_addresses(spec.compile())
+        find_addresses(go1.ROBOT, spec.compile())
 
 
 def test_contact_follows_the_force_threshold(model, data):
-    observe = build_observe(model, 5.0)
+    observe = build_observe(go1.ROBOT, model, 5.0)
     forces = jnp.array([4.9, 5.1, 0.0, 80.0])
     contact = observe(jnp.asarray(data.qpos), jnp.asarray(data.qvel), forces).contact
     assert contact.tolist() == [False, True, False, True]
@@ -110,8 +111,8 @@ def test_noise_scale_follows_the_config():
 
 
 def test_the_same_mjcf_gives_a_free_base_with_the_same_robot():
-    free = build_model(SimConfig(base="free"))
-    planar = build_model(SimConfig(base="planar"))
+    free = build_model(go1.ROBOT, SimConfig(base="free"))
+    planar = build_model(go1.ROBOT, SimConfig(base="planar"))
     assert (free.nq, free.nv, free.nu) == (19, 18, 12)
     assert (planar.nq, planar.nv, planar.nu) == (15, 15, 12)
     np.testing.assert_array_equal(free.body_mass, planar.body_mass)
@@ -119,7 +120,7 @@ def test_the_same_mjcf_gives_a_free_base_with_the_same_robot():
 
 
 def test_both_bases_show_the_controller_the_same_robot(model, data):
-    free_model = build_model(SimConfig(base="free"))
+    free_model = build_model(go1.ROBOT, SimConfig(base="free"))
     free = mujoco.MjData(free_model)
     half = 0.5 * data.qpos[2]
     free.qpos[:7] = [data.qpos[0], 0, data.qpos[1], np.cos(half), 0, np.sin(half), 0]
@@ -132,6 +133,6 @@ def test_both_bases_show_the_controller_the_same_robot(model, data):
 
 
 def test_feet_only_contacts_leave_the_feet_and_nothing_else():
-    model = build_model(SimConfig(contacts="feet"))
+    model = build_model(go1.ROBOT, SimConfig(contacts="feet"))
     solid = [model.geom(i).name for i in range(model.ngeom) if model.geom_conaffinity[i]]
     assert sorted(solid) == ["FL_foot", "FR_foot", "RL_foot", "RR_foot"]

@@ -103,9 +103,9 @@ def keys():
 
 def program(config):
     """What ``plan`` and ``act`` compute, as text."""
-    model = build_model(config.sim, visual=False)
+    model = build_model(go1.ROBOT, config.sim, visual=False)
     spec = scene.batch_spec(config)
-    walk = build_walk(spec, model, find_addresses(model).actuator, held=False)
+    walk = build_walk(spec, model, find_addresses(go1.ROBOT, model).actuator, held=False)
     tables = condense(*resolve(config, go1.PARAMS))
     episode = jax.tree.map(lambda leaf: leaf[0], scene.stack_episodes([config]))
     sensed = Sensed(np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nsensordata))

@@ -96,7 +96,7 @@ def test_contact_flags_that_lie_do_not_throw_the_robot(simulation, name):
     """Flags come from the foot forces, which are replaced here; the physics knows the truth."""
     model, at, config = simulation.model, simulation.addresses, simulation.config
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(config, model.nq, model.nv)
+    data.qpos[:], data.qvel[:] = initial_state(config, model)
     mujoco.mj_forward(model, data)
     noise = np.zeros(30)
 

@@ -27,7 +27,7 @@ def model():
 def standing(model):
     """The robot on its feet, legs loaded: (qpos, qvel, ctrl)."""
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(CONFIG, model.nq, model.nv)
+    data.qpos[:], data.qvel[:] = initial_state(CONFIG, model)
     names = [model.actuator(i).name for i in range(model.nu)]
     joints = [model.actuator_trnid[i, 0] for i in range(len(names))]
     goal = data.qpos[[model.jnt_qposadr[j] for j in joints]].copy()

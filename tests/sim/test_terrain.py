@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, SimConfig, TerrainConfig, load_config
+from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim import terrain
 from kjax.sim.episode import initial_state
@@ -58,17 +59,17 @@ def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
     """Same physics: a ball dropped on the moved field does what it does on the compiled one."""
     first = TerrainConfig(kind=kind, seed=1)
     second = TerrainConfig(kind=kind, seed=2)
-    moved = build_model(SimConfig(), first)
+    moved = build_model(go1.ROBOT, SimConfig(), first)
     terrain.place(moved, terrain.generate(second, 0.8))
-    compiled = build_model(SimConfig(), second)
+    compiled = build_model(go1.ROBOT, SimConfig(), second)
     for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound"):
         np.testing.assert_allclose(getattr(moved, name), getattr(compiled, name), atol=1e-12)
     np.testing.assert_allclose(moved.geom_aabb, compiled.geom_aabb, atol=1e-12)
     states = []
     for model in (moved, compiled):
         data = mujoco.MjData(model)
-        height, joints = go1.stand_pose(0.27)
-        data.qpos[find_addresses(model).qpos] = joints
+        height, joints = stand_pose(go1.PARAMS, 0.27)
+        data.qpos[find_addresses(go1.ROBOT, model).qpos] = joints
         data.qpos[:2] = 1.0, height + 0.1
         mujoco.mj_step(model, data, 300)
         states.append(data.qpos.copy())
@@ -76,14 +77,14 @@ def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
 
 
 def test_a_field_of_another_size_is_refused():
-    model = build_model(SimConfig(base="planar"), TerrainConfig(kind="paper"))
+    model = build_model(go1.ROBOT, SimConfig(base="planar"), TerrainConfig(kind="paper"))
     with pytest.raises(ValueError, match="4 obstacles, the scene holds 8"):
         terrain.place(model, terrain.generate(TerrainConfig(kind="slope"), 0.8))
 
 
 def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
     config = TerrainConfig(kind="slope", slope=10.0)
-    model = build_model(SimConfig(base="planar"), config)
+    model = build_model(go1.ROBOT, SimConfig(base="planar"), config)
     data = mujoco.MjData(model)
     data.qpos[1] = 5.0  # the robot out of the way
     mujoco.mj_forward(model, data)
@@ -104,7 +105,7 @@ def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
 
 def test_a_slope_downwards_starts_level_and_comes_up_again():
     config = TerrainConfig(kind="slope", slope=-10.0)
-    model = build_model(SimConfig(base="planar", floor=0.5), config)
+    model = build_model(go1.ROBOT, SimConfig(base="planar", floor=0.5), config)
     data = mujoco.MjData(model)
     data.qpos[1] = 5.0  # the robot out of the way
     mujoco.mj_forward(model, data)
@@ -128,10 +129,10 @@ def test_a_slope_downwards_starts_level_and_comes_up_again():
 def test_a_patch_is_slippery_under_a_foot():
     """A foot's priority overrules the ground's friction; a patch overrules the foot's."""
     config = TerrainConfig(kind="patches", patch_friction=0.2, start=0.19, end=0.6, count=1)
-    model = build_model(SimConfig(base="planar"), config)
+    model = build_model(go1.ROBOT, SimConfig(base="planar"), config)
     data = mujoco.MjData(model)
-    height, joints = go1.stand_pose(0.27)
-    data.qpos[find_addresses(model).qpos] = joints
+    height, joints = stand_pose(go1.PARAMS, 0.27)
+    data.qpos[find_addresses(go1.ROBOT, model).qpos] = joints
     data.qpos[1] = height
     mujoco.mj_forward(model, data)
     friction = {}
@@ -160,11 +161,11 @@ def test_heights_follow_the_ground_under_the_stance_feet():
     }
     config = load_config(RunConfig, None, common)
     simulation = build_simulation(config)
-    original = initial_state(config, 15, 15)
+    original = initial_state(config, simulation.model)
     lifted = original[0].copy()
     lifted[:2] += 1.0, rise
 
-    def start(config, nq, nv):
+    def start(config, model):
         return lifted, original[1]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -58,7 +58,7 @@ def test_forces_that_joints_and_ground_can_give_pass_unchanged():
 
 def test_the_legs_angular_momentum_is_mujocos():
     """Planar Go1, trunk at rest or moving, legs swinging: MuJoCo's less the trunk's own share."""
-    model = scene.build_model(SimConfig())
+    model = scene.build_model(go1.ROBOT, SimConfig())
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     for trial in range(5):

@@ -61,8 +61,8 @@ def test_a_moving_mean_of_a_line_is_that_line():
 
 
 def test_the_stick_animation_moves(saved):
-    folder, run, _ = saved
-    video.stick_video(run, folder / "stick.mp4")
+    folder, run, config = saved
+    video.stick_video(run, config, folder / "stick.mp4")
     images = frames(folder / "stick.mp4")
     assert len(images) == pytest.approx(0.6 * video.FPS, abs=2)
     assert np.abs(images[0].astype(int) - images[-1]).max() > 50
