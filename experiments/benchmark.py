@@ -34,7 +34,7 @@ from kjax import cli
 from kjax.config import RunConfig
 from kjax.sim.episode import initial_state, metrics
 from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
-from kjax.sim.observe import noise_dim
+from kjax.sim.noise import noise_dim
 
 STUDIES = {
     "qp": qp_benchmark,

@@ -22,7 +22,7 @@ from kjax.legs.posture import stand_pose
 from kjax.resolve import build_command
 from kjax.robots import Robot, get_robot
 from kjax.sim import free_base
-from kjax.sim.observe import NOISE_DIM, Observe, find_addresses, noise_dim, noise_scale
+from kjax.sim.observe import Observe, find_addresses
 from kjax.sim.scene import robot_addresses
 from kjax.types import COMMAND_NAMES, RobotParams
 from kjax.walkable import build_gaits
@@ -156,36 +156,6 @@ def initial_state(config: RunConfig, model: mujoco.MjModel) -> tuple[np.ndarray,
     qpos[: len(pose)], qvel[: len(rates)] = pose, rates
     find_addresses(robot, model).set_joints(qpos, joints)
     return qpos, qvel
-
-
-def sensor_noise(config: RunConfig, steps: int, start: int = 0) -> np.ndarray:
-    """Noise (steps, n) of an episode from step ``start`` on; n is 30, or 36 for a free base.
-
-    The noise of a step depends on the seed and the step's number only, so that episodes may be
-    drawn in pieces and are the same on every engine.
-    """
-    scale = noise_scale(config.noise, config.sim.base)
-    if not scale.any():
-        return np.zeros((steps, len(scale)))
-    numbers = np.arange(start, start + steps, dtype=np.int32)
-    rows = _noise_rows(np.int32(config.seed), numbers, config.sim.base)
-    return np.asarray(rows, float) * scale
-
-
-def noise_row(seed: Int[jax.Array, ""], step: Int[jax.Array, ""], base: str) -> jax.Array:
-    """Standard normal vector (n,) of an episode's step, float32."""
-    streams = [(1, NOISE_DIM)]
-    if base == "free":
-        streams.append((2, noise_dim("free") - NOISE_DIM))  # its own: the rest is the planar one's
-
-    def draw(name: int, size: int) -> jax.Array:
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), name), step)
-        return jax.random.normal(key, (size,), jnp.float32)
-
-    return jnp.concatenate([draw(name, size) for name, size in streams])
-
-
-_noise_rows = jax.jit(jax.vmap(noise_row, in_axes=(None, 0, None)), static_argnums=2)
 
 
 def origin(sim: SimConfig) -> np.ndarray:

@@ -6,14 +6,12 @@ an end get the same, as the models know one force per end. What the planner reme
 planned it.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax.config import NoiseConfig, RunConfig
-
-_STREAM = 3  # of random numbers; 1 and 2 are those of ``episode.noise_row``
+from kjax.sim.noise import FORCES, normal_row, normal_rows
 
 
 def force_deviation(noise: NoiseConfig) -> float:
@@ -23,18 +21,13 @@ def force_deviation(noise: NoiseConfig) -> float:
 
 def force_row(seed: Int[Array, ""], step: Int[Array, ""]) -> Float[Array, "4"]:
     """Standard normal vector (front x, z, rear x, z) of the tick that begins at a physics step."""
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), _STREAM), step)
-    return jax.random.normal(key, (4,), jnp.float32)
-
-
-_force_rows = jax.jit(jax.vmap(force_row, in_axes=(None, 0)))
+    return normal_row(seed, step, FORCES, 4)
 
 
 def force_noise(config: RunConfig, ticks: int) -> Float[np.ndarray, "ticks 4"]:
     """Forces [N] that an episode adds at its control ticks."""
     per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    steps = np.arange(ticks, dtype=np.int32) * np.int32(per_tick)
-    rows = np.asarray(_force_rows(np.int32(config.seed), steps))
+    rows = normal_rows(config.seed, np.arange(ticks) * per_tick, FORCES, 4)
     return rows * np.float32(force_deviation(config.noise))
 
 

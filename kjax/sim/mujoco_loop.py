@@ -26,10 +26,10 @@ from kjax.sim.episode import (
     initial_state,
     origin,
     sagittal,
-    sensor_noise,
 )
 from kjax.sim.excitation import force_deviation, force_noise, perturb
-from kjax.sim.observe import Addresses, Observe, add_noise, build_observe, find_addresses, noise_dim
+from kjax.sim.noise import add_noise, noise_dim, sensor_noise
+from kjax.sim.observe import Addresses, Observe, build_observe, find_addresses
 from kjax.sim.push import push_force
 from kjax.sim.resolve import batch_spec
 from kjax.sim.scene import apply_scene, build_model
@@ -39,9 +39,6 @@ from kjax.types import Command, Observation
 # Called once per control tick with the steps done, the steps in all and the data; return value
 # ignored. For progress bars and viewers.
 OnTick = Callable[[int, int, mujoco.MjData], None]
-
-
-_NOISE_TICKS = 1000  # noise is drawn for so many ticks at once
 
 
 class TickLog(NamedTuple):
@@ -220,9 +217,6 @@ def build_simulation(config: RunConfig) -> Simulation:
     sensed = np.zeros(example.shape)
     state = simulation.init(sensed)
     jax.block_until_ready((simulation.plan(state, sensed), simulation.act(state, sensed)))
-    # The noise's program as well: a Ctrl-C during a compilation can take the process down.
-    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    sensor_noise(config, _NOISE_TICKS * per_tick)
     return simulation
 
 
@@ -292,10 +286,7 @@ def simulate(
     per_act = round(config.leg.act_dt / config.sim.sim_dt)
     ticks = -(-round(config.duration / config.sim.sim_dt) // per_tick)
     steps = ticks * per_tick
-    # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
-    piece = _NOISE_TICKS * per_tick
-    noise = sensor_noise(config, piece)
-    cuts = np.cumsum([model.nq, model.nv, model.nsensordata, noise.shape[1]])
+    cuts = np.cumsum([model.nq, model.nv, model.nsensordata, noise_dim(config.sim.base)])
     excited = force_deviation(config.noise) > 0
     added = force_noise(config, ticks) if excited else np.zeros((ticks, 0))
     sensed = np.zeros(cuts[-1] + added.shape[1])
@@ -304,7 +295,7 @@ def simulate(
         sensed[: cuts[0]] = data.qpos
         sensed[cuts[0] : cuts[1]] = data.qvel
         sensed[cuts[1] : cuts[2]] = data.sensordata
-        sensed[cuts[2] : cuts[3]] = noise[step % piece]
+        sensed[cuts[2] : cuts[3]] = noise[step - first_step]
         return sensed
 
     qpos, qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
@@ -318,6 +309,7 @@ def simulate(
     logs: list[np.ndarray] = []
     actuators, sign, trunk = at.actuator.reshape(-1), at.sign.reshape(-1), at.trunk
 
+    first_step, noise = 0, sensor_noise(config, per_tick)
     state = simulation.init(sense(0), requests(config))
 
     fell = interrupted = False
@@ -325,9 +317,9 @@ def simulate(
     begin = time.perf_counter()
     try:
         for tick in _until_ctrl_c(range(ticks)):
-            if tick > 0 and tick % _NOISE_TICKS == 0:
-                noise = sensor_noise(config, piece, tick * per_tick)
-            sense(tick * per_tick)
+            first_step = tick * per_tick
+            noise = sensor_noise(config, per_tick, first_step)
+            sense(first_step)
             sensed[cuts[3] :] = added[tick]
             clock = time.perf_counter()
             state, log = simulation.plan(state, sensed)

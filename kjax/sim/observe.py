@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from kjax.config import NoiseConfig
 from kjax.robots import Robot
 from kjax.types import Observation
 
@@ -120,77 +119,3 @@ def build_observe(robot: Robot, model: mujoco.MjModel, contact_threshold: float)
         )
 
     return observe_free if is_free else observe_planar
-
-
-NOISE_DIM = 30  # planar: x, z, pitch; their rates; 12 joint angles; 12 joint rates
-FREE_NOISE_DIM = 36  # the same, then: y, roll, yaw; their rates
-
-
-def noise_dim(base: str) -> int:
-    """Length of the noise vector of a base."""
-    return FREE_NOISE_DIM if base == "free" else NOISE_DIM
-
-
-def noise_scale(config: NoiseConfig, base: str = "planar") -> Float[np.ndarray, "noise"]:
-    """Standard deviation of each entry of the noise vector (zero where noise is off)."""
-    scale = np.concatenate(
-        [
-            [config.position, config.position, config.pitch],
-            [config.velocity, config.velocity, config.pitch_rate],
-            np.full(12, config.joint_position),
-            np.full(12, config.joint_velocity),
-        ]
-    )
-    if base == "free":
-        sideways = [config.position, config.pitch, config.pitch]
-        rates = [config.velocity, config.pitch_rate, config.pitch_rate]
-        scale = np.concatenate([scale, sideways, rates])
-    return scale * config.enabled
-
-
-def add_noise(observation: Observation, noise: Float[Array, "noise"]) -> Observation:
-    """Observation with a noise vector added; zero noise changes nothing.
-
-    The vector's length says which base it is for: 30 for the planar one, whose trunk has no roll
-    and no yaw, 36 for the free one.
-    """
-    if noise.shape[-1] == FREE_NOISE_DIM:
-        return _add_free_noise(observation, noise)
-    x, z, pitch, v_x, v_z, rate = noise[:6]
-    w, _, y, _ = observation.base_quat
-    # Nose-up by ``pitch``: a turn about y by -pitch, to first order, then normalised.
-    w, y = w + 0.5 * pitch * y, y - 0.5 * pitch * w
-    norm = jnp.sqrt(w * w + y * y)
-    zero = jnp.zeros_like(w)
-    return observation._replace(
-        base_pos=observation.base_pos + jnp.stack([x, zero, z]),
-        base_quat=jnp.stack([w / norm, zero, y / norm, zero]),
-        base_vel=observation.base_vel + jnp.stack([v_x, zero, v_z]),
-        base_ang_vel=observation.base_ang_vel + jnp.stack([zero, -rate, zero]),
-        joint_pos=observation.joint_pos + noise[6:18].reshape(4, 3),
-        joint_vel=observation.joint_vel + noise[18:30].reshape(4, 3),
-    )
-
-
-def _add_free_noise(observation: Observation, noise: Float[Array, "noise"]) -> Observation:
-    x, z, pitch, v_x, v_z, rate = noise[:6]
-    y, roll, yaw, v_y, roll_rate, yaw_rate = noise[30:]
-    # A small turn about the trunk's own axes, to first order, then normalised.
-    w, i, j, k = observation.base_quat
-    a, b, c = 0.5 * roll, -0.5 * pitch, 0.5 * yaw
-    quat = jnp.stack(
-        [
-            w - i * a - j * b - k * c,
-            i + w * a + j * c - k * b,
-            j + w * b - i * c + k * a,
-            k + w * c + i * b - j * a,
-        ]
-    )
-    return observation._replace(
-        base_pos=observation.base_pos + jnp.stack([x, y, z]),
-        base_quat=quat / jnp.sqrt(jnp.sum(quat**2)),
-        base_vel=observation.base_vel + jnp.stack([v_x, v_y, v_z]),
-        base_ang_vel=observation.base_ang_vel + jnp.stack([roll_rate, -rate, yaw_rate]),
-        joint_pos=observation.joint_pos + noise[6:18].reshape(4, 3),
-        joint_vel=observation.joint_vel + noise[18:30].reshape(4, 3),
-    )

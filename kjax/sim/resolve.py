@@ -21,7 +21,7 @@ from kjax.params import Tables, condense
 from kjax.resolve import build_command, controller_key, controller_spec, resolve
 from kjax.sim.episode import origin
 from kjax.sim.excitation import force_deviation
-from kjax.sim.observe import noise_scale
+from kjax.sim.noise import noise_scale
 from kjax.sim.push import impulses
 from kjax.spec import ControllerSpec
 from kjax.types import Command

@@ -18,9 +18,10 @@ from kjax.controller import build_controller
 from kjax.legs.base import build_base
 from kjax.params import Tables
 from kjax.robots import Robot
-from kjax.sim.episode import FALL_HEIGHT, FALL_TILT, noise_row
+from kjax.sim.episode import FALL_HEIGHT, FALL_TILT
 from kjax.sim.excitation import force_row, perturb
-from kjax.sim.observe import add_noise, build_observe, find_addresses
+from kjax.sim.noise import SENSORS, add_noise, noise_dim, normal_row
+from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.resolve import BatchSpec, EpisodeParams
 from kjax.state import ControllerState
 from kjax.types import Observation, RobotParams
@@ -108,10 +109,10 @@ def build_walk(robot: Robot, spec: BatchSpec, model: mujoco.MjModel, *, held: bo
     def sense(episode: EpisodeParams, step: Array, sensed: Sensed) -> Observation:
         if not scene.noise:
             return see(sensed)
-        row = noise_row(episode.seed, step, scene.base).astype(sensed.qpos.dtype)
-        seen = add_noise(see(sensed), row * episode.noise_scale.astype(row.dtype))
-        # Else XLA draws the numbers again for each of their uses.
-        return jax.lax.optimization_barrier(seen)
+        row = normal_row(episode.seed, step, SENSORS, noise_dim(scene.base))
+        row = row.astype(sensed.qpos.dtype) * episode.noise_scale.astype(sensed.qpos.dtype)
+        # Else XLA reads the numbers again for each of their uses.
+        return jax.lax.optimization_barrier(add_noise(see(sensed), row))
 
     def init(tables: Tables, episode: EpisodeParams, sensed: Sensed) -> WalkState:
         first = sense(episode, jnp.zeros((), jnp.int32), sensed)

@@ -8,8 +8,9 @@ import pytest
 
 from kjax.config import RunConfig, SimConfig, load_config
 from kjax.robots import go1
-from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics, sensor_noise
+from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate
+from kjax.sim.noise import sensor_noise
 
 SHORT = {
     "sim.base": "planar",

@@ -11,9 +11,10 @@ from kjax.config import RunConfig, SimConfig, load_config
 from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim import free_base, mjx_loop
-from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics, sensor_noise
+from kjax.sim.episode import Trajectory, fallen, foot_slip, initial_state, metrics
 from kjax.sim.mujoco_loop import build_simulation, simulate
-from kjax.sim.observe import FREE_NOISE_DIM, add_noise, build_observe
+from kjax.sim.noise import FREE_NOISE_DIM, add_noise, sensor_noise
+from kjax.sim.observe import build_observe
 from kjax.sim.scene import build_model
 
 FREE = {"sim.base": "free", "sim.contacts": "feet"}

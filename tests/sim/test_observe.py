@@ -7,7 +7,8 @@ from kjax.config import NoiseConfig, SimConfig
 from kjax.legs.kinematics import planar_state
 from kjax.legs.posture import stand_pose
 from kjax.robots import go1
-from kjax.sim.observe import NOISE_DIM, add_noise, build_observe, find_addresses, noise_scale
+from kjax.sim.noise import NOISE_DIM, add_noise, noise_scale
+from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.scene import build_model, build_spec
 from kjax.types import JOINT_NAMES, Leg
 
