@@ -32,8 +32,8 @@ import simulation_benchmark
 
 from kjax import cli
 from kjax.config import RunConfig
+from kjax.sim.engines.mujoco import MujocoEngine, requests, simulate
 from kjax.sim.episode import initial_state, metrics
-from kjax.sim.mujoco_loop import Simulation, build_simulation, simulate
 from kjax.sim.noise import noise_dim
 
 STUDIES = {
@@ -94,13 +94,14 @@ def study(name: str, words: list[str]) -> None:
 
 def controller_latency(config: RunConfig) -> dict[str, Any]:
     """Latency of the compiled calls on inputs from a walk, and of their floors [ms]."""
-    simulation = build_simulation(config)
+    simulation = MujocoEngine(config)
     states, sensed, data = _walk(simulation)
+    program = simulation.program(config)
     noop = jax.jit(lambda state, sensed: (state + 1.0, sensed[:12] * 2.0))
     calls: dict[str, Callable[[Any, Any], Any]] = {
         "noop": noop,
-        "act": simulation.act,
-        "plan": simulation.plan,
+        "act": program.act,
+        "plan": program.plan,
     }
     times: dict[str, list[float]] = {name: [] for name in (*calls, "physics")}
     for call in calls.values():
@@ -126,24 +127,25 @@ def controller_latency(config: RunConfig) -> dict[str, Any]:
     return result
 
 
-def _walk(simulation: Simulation) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
+def _walk(simulation: MujocoEngine) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
     """Controller states and sensor vectors along a walk, and the data at its end."""
-    model, at = simulation.model, simulation.addresses
+    model, config = simulation.model, simulation.config
+    program = simulation.program(config)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(simulation.config, model)
+    data.qpos[:], data.qvel[:] = initial_state(config, model)
     mujoco.mj_forward(model, data)
     states, sensed = [], []
-    noise = noise_dim(simulation.config.sim.base)
+    noise = noise_dim(config.sim.base) * config.noise.enabled
     state = None
     for i in range(WALK):
         now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(noise)])
-        state = simulation.init(now) if state is None else state
+        state = program.init(now, requests(config)) if state is None else state
         if i % 5 == 0:
-            state, _ = simulation.plan(state, now)
+            state, _ = program.plan(state, now)
         states.append(state)
         sensed.append(now)
-        state, torque = simulation.act(state, now)
-        data.ctrl[at.actuator.reshape(-1)] = torque
+        state, torque = program.act(state, now)
+        data.ctrl[:] = torque
         mujoco.mj_step(model, data)
     return states, sensed, data
 

@@ -19,8 +19,8 @@ from tqdm import tqdm
 from kjax import cli
 from kjax.config import ConfigError, RunConfig
 from kjax.episodes import Store, code_version, config_hash
+from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
 from kjax.sim.episode import SETTLE_TIME, Trajectory, metrics
-from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate
 from kjax.sim.summary import summarise
 
 # What the table shows: metric, printed name, format.
@@ -76,7 +76,7 @@ def main() -> None:
     store = None if args.seeds is None else open_seeds(config, folder, restart=args.restart)
     clock = time.perf_counter()
     try:
-        simulation = build_simulation(config)
+        simulation = MujocoEngine(config)
     except ConfigError as error:
         cli.fail(str(error))
     print(f"models fitted, controller compiled: {time.perf_counter() - clock:.1f} s", flush=True)
@@ -119,7 +119,7 @@ def save_run(run: Trajectory, config: RunConfig, folder: Path, args: argparse.Na
 
 
 def _simulate_with_bar(
-    simulation: Simulation, config: RunConfig, *, view: bool = False, label: str = ""
+    simulation: MujocoEngine, config: RunConfig, *, view: bool = False, label: str = ""
 ) -> Trajectory:
     with tqdm(total=config.duration, unit="s", desc=label or "simulated", leave=False, disable=None,
               bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.1f}/{total:.1f} s "
@@ -155,7 +155,7 @@ def require_display() -> None:
             cli.fail("--view: no window can be opened here (no display?); try --video")
 
 
-def _simulate_in_viewer(simulation: Simulation, config: RunConfig, on_tick: OnTick) -> Trajectory:
+def _simulate_in_viewer(simulation: MujocoEngine, config: RunConfig, on_tick: OnTick) -> Trajectory:
     """Run at real-time pace in MuJoCo's passive viewer."""
     import mujoco.viewer
 
@@ -200,7 +200,7 @@ def open_seeds(config: RunConfig, folder: Path, *, restart: bool = False) -> Sto
 
 
 def run_seeds(
-    simulation: Simulation, config: RunConfig, count: int, store: Store
+    simulation: MujocoEngine, config: RunConfig, count: int, store: Store
 ) -> tuple[Trajectory | None, RunConfig]:
     """Run seeds, each saved as it ends; returns the first run of this call and its config.
 

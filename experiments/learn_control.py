@@ -25,8 +25,8 @@ from kjax.koopman.dataset import ranges_from_config, sample
 from kjax.resolve import resolve
 from kjax.rigid_body import own_body
 from kjax.robots import get_robot
-from kjax.sim.batch_loop import BatchEngine
 from kjax.sim.closed_cost import recording_costs
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.types import MODE_ALPHA, Mode

@@ -189,7 +189,7 @@ def config_of(gait: str, keys: dict[str, Any]) -> RunConfig:
 
 def run(configs: list[RunConfig]) -> list[dict[str, Any]]:
     """Metrics of the episodes."""
-    from kjax.sim.batch_loop import BatchEngine
+    from kjax.sim.engines.mujoco_batch import BatchEngine
 
     recording = BatchEngine(configs[0], torques="held").run(configs)
     if recording.interrupted:

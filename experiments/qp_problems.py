@@ -14,16 +14,17 @@ from kjax.config import RunConfig, load_config
 from kjax.controller import build_controller
 from kjax.mpc import lmpc, multiphase
 from kjax.resolve import controller_spec
+from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
-from kjax.sim.mujoco_loop import build_simulation
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
     """What ``planner`` returns as memory along a walk of the config's own controller."""
-    simulation = build_simulation(config)
-    controller, tables, model = simulation.controller, simulation.tables, simulation.model
+    simulation = MujocoEngine(config)
+    controller, model = build_controller(controller_spec(config)), simulation.model
+    tables = simulation.program(config).tables
     recorder = build_controller(controller_spec(config), planner)
     plan, act = jax.jit(controller.plan), jax.jit(controller.act)
     look = jax.jit(lambda state, seen: recorder.plan(tables, state, seen)[0].memory)
@@ -64,7 +65,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
         return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
 
     mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
-    hessian = build_simulation(config).tables.lmpc.hessian
+    hessian = MujocoEngine(config).program(config).tables.lmpc.hessian
     H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
     used = (upper > lower).any(axis=1)  # nothing is planned in flight
     return {

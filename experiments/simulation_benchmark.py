@@ -21,11 +21,11 @@ import simulation_report
 
 from kjax.config import RunConfig, load_config
 from kjax.robots import get_robot
-from kjax.sim.batch_loop import BatchEngine, scene_models
+from kjax.sim.engines.mjx import MjxEngine
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.engines.mujoco_batch import BatchEngine, scene_models
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
-from kjax.sim.mjx_loop import MjxEngine
-from kjax.sim.mujoco_loop import build_simulation, simulate
 from kjax.sim.observe import find_addresses
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -158,7 +158,7 @@ def bare_batch(
 def python_loop(seconds: float) -> dict[str, float]:
     """The obvious alternative: one robot after the other, torques at every step."""
     config = cases("trot", 1, seconds)[0]
-    simulation = build_simulation(config)
+    simulation = MujocoEngine(config)
     simulate(simulation)
     times = [simulate(simulation, seed=seed).wall_time for seed in range(3)]
     return {
@@ -282,7 +282,7 @@ def mjx_compile_times() -> dict[str, float]:
         "from kjax import cli; cli.configure_jax(parallel=True)\n"
         "import jax; jax.config.update('jax_enable_x64', False)\n"
         "import simulation_benchmark as b\n"
-        "from kjax.sim.mjx_loop import MjxEngine\n"
+        "from kjax.sim.engines.mjx import MjxEngine\n"
         "configs = b.cases('trot', 16, 0.05); engine = MjxEngine(configs[0])\n"
         "clock = time.perf_counter(); r = engine.run(configs)\n"
         "print(time.perf_counter() - clock)\n"

@@ -27,8 +27,8 @@ from tqdm import tqdm
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig
 from kjax.episodes import code_version, config_hash
-from kjax.sim.batch_loop import BatchEngine
 from kjax.sim.closed_cost import recording_costs
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.tuning.optimise import build_objective, check_checkpoint, descend

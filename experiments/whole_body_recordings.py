@@ -88,7 +88,7 @@ def label(configs: list[RunConfig]) -> tuple[str, str]:
 
 def record(kind: str, args: Any, folder: Path) -> list[Episode]:
     """Episodes of a kind, from the folder where they lie there already."""
-    from kjax.sim.batch_loop import BatchEngine
+    from kjax.sim.engines.mujoco_batch import BatchEngine
 
     there = kept(kind, args, folder)
     if there is not None:

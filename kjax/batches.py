@@ -13,7 +13,8 @@ from tqdm import tqdm
 
 from kjax.config import RunConfig
 from kjax.episodes import Record, Store, config_hash
-from kjax.sim.batch_loop import BatchEngine, Torques
+from kjax.sim.engines.contract import Torques
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import Trajectory
 
 Measure = Callable[[Trajectory, RunConfig], dict[str, Any]]

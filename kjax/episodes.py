@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -24,9 +24,10 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import RunConfig, to_dict
-from kjax.koopman.storage import resolve
+from kjax.files import file_hashes
+from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
 from kjax.sim.episode import Trajectory, metrics
-from kjax.sim.mujoco_loop import OnTick, Simulation, build_simulation, simulate, simulation_key
+from kjax.sim.resolve import BatchSpec, batch_spec
 
 # Called in the worker with each finished run and the file that belongs to it.
 Record = Callable[[Trajectory, Path], None]
@@ -62,23 +63,6 @@ def config_hash(config: Any) -> str:
     values = to_dict(config)
     text = json.dumps(values, sort_keys=True) + "".join(file_hashes(config).values())
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-# Config keys that name a file whose content a result depends on.
-FILE_KEYS = ("koopman.file",)
-
-
-def file_hashes(config: Any) -> dict[str, str]:
-    """Hash of the content of every file that a config names: key -> hash; of none, "none"."""
-    hashes = {}
-    for key in FILE_KEYS:
-        section, name = key.split(".")
-        file = getattr(getattr(config, section, None), name, "")
-        if file:
-            path = resolve(file)
-            content = path.read_bytes() if path.is_file() else None
-            hashes[key] = "none" if content is None else hashlib.sha256(content).hexdigest()[:16]
-    return hashes
 
 
 class Store:
@@ -272,21 +256,20 @@ def _episode_of_call(
         return {"interrupted": True}
 
 
-_KEPT = 4  # simulations that a process keeps
-_built: dict[Hashable, Simulation] = {}
-_built_of: dict[Hashable, dict[str, str]] = {}  # the files that each was built from
+_KEPT = 4  # engines that a process keeps
+_engines: dict[BatchSpec, MujocoEngine] = {}
 
 
 def _episode(
     config: RunConfig, record: Record | None, path: Path, on_tick: OnTick | None = None
 ) -> dict[str, Any]:
-    """Run one episode, in a simulation that is kept for those to come."""
-    key, files = simulation_key(config), file_hashes(config)
-    if key not in _built or _built_of.get(key, {}) != files:
-        while len(_built) >= _KEPT:
-            del _built[next(iter(_built))]
-        _built[key], _built_of[key] = build_simulation(config), files
-    run = simulate(_built[key], config, on_tick=on_tick)
+    """Run one episode, on an engine that is kept for those to come."""
+    spec = batch_spec(config)
+    if spec not in _engines:
+        while len(_engines) >= _KEPT:
+            del _engines[next(iter(_engines))]
+        _engines[spec] = MujocoEngine(config)
+    run = simulate(_engines[spec], config, on_tick=on_tick)
     if record is not None and not run.interrupted:
         path.parent.mkdir(parents=True, exist_ok=True)
         record(run, path)

@@ -26,7 +26,7 @@ from kjax.koopman.features import affine, clock_history  # noqa: E402
 from kjax.koopman.transitions import Episode, split, transitions  # noqa: E402
 from kjax.rigid_body import own_body  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
-from kjax.sim.batch_loop import BatchEngine  # noqa: E402
+from kjax.sim.engines.mujoco_batch import BatchEngine  # noqa: E402
 
 DT, ROBOTS = 0.005, 12
 

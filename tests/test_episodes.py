@@ -14,9 +14,11 @@ import pytest
 
 from kjax import episodes
 from kjax.config import FitStudyConfig, PushConfig, RunConfig, fields, load_config
+from kjax.files import FILE_KEYS
 from kjax.koopman import storage
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.episode import metrics
-from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
+from kjax.sim.resolve import batch_spec
 from kjax.types import Mode
 
 SHORT = {
@@ -38,9 +40,9 @@ def config():
 @pytest.fixture(scope="module", autouse=True)
 def simulation(config):
     """Built once; the runner finds it where a worker would have left it."""
-    built = build_simulation(config)
-    episodes._built.clear()
-    episodes._built[simulation_key(config)] = built
+    built = MujocoEngine(config)
+    episodes._engines.clear()
+    episodes._engines[batch_spec(config)] = built
     return built
 
 
@@ -155,16 +157,14 @@ def test_a_retrained_model_under_the_same_name_is_another_config(tmp_path):
     assert episodes.config_hash(config) != first
 
 
-def test_a_simulation_is_built_anew_from_a_retrained_model(tmp_path, monkeypatch):
+def test_a_program_is_compiled_anew_from_a_retrained_model(tmp_path, monkeypatch):
     built = []
-    monkeypatch.setattr(episodes, "build_simulation", lambda config: built.append(config))
-    monkeypatch.setattr(episodes, "simulate", lambda *a, **k: None)
-    monkeypatch.setattr(episodes, "metrics", lambda *a: {})
-    monkeypatch.setattr(episodes, "_built", {})
+    monkeypatch.setattr(MujocoEngine, "_compiled", lambda self, config: built.append(config))
     config = with_file(retrain(tmp_path / "model.npz", 1e-3))
+    engine = MujocoEngine(config)
     for value, count in ((1e-3, 1), (2e-3, 2), (2e-3, 2)):
         retrain(tmp_path / "model.npz", value)
-        episodes._episode(config, None, tmp_path / "series.npz")
+        engine.program(config)
         assert len(built) == count
 
 
@@ -173,7 +173,7 @@ def test_every_config_key_that_names_a_file_is_hashed_by_content():
         name for cls in (RunConfig, FitStudyConfig) for name, *_ in fields(cls)
         if name.rsplit(".", 1)[-1] in ("file", "path") or name.endswith(("_file", "_path"))
     ]  # fmt: skip
-    assert set(named) == set(episodes.FILE_KEYS)
+    assert set(named) == set(FILE_KEYS)
 
 
 def test_a_study_s_own_file_is_part_of_the_code(tmp_path):
@@ -236,7 +236,7 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
             "push.forward": 1.0,
         },
     )
-    shared, own = simulate(simulation, other), simulate(build_simulation(other))
+    shared, own = simulate(simulation, other), simulate(MujocoEngine(other))
     assert shared.time[np.argmax(np.diff(shared.gait) != 0)] == pytest.approx(0.399)
     # 1e-9: constants that the compiler folds in one of the two round differently
     np.testing.assert_allclose(shared.qpos, own.qpos, atol=1e-9)
@@ -245,10 +245,10 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
     assert first["fell"] == second["fell"]
 
 
-def test_a_config_that_needs_another_simulation_is_refused(config, simulation):
-    with pytest.raises(ValueError, match="simulation_key"):
-        simulate(simulation, dataclasses.replace(config, leg=dataclasses.replace(
-            config.leg, swing_height=0.2)))  # fmt: skip
+def test_a_config_that_needs_another_engine_is_refused(config, simulation):
+    longer = dataclasses.replace(config, lmpc=dataclasses.replace(config.lmpc, horizon=7))
+    with pytest.raises(ValueError, match=r"controller\.horizon is 7, the engine's 6"):
+        simulate(simulation, longer)
 
 
 PARENT = """

@@ -196,12 +196,6 @@ def sagittal(
     return np.asarray(x), np.asarray(feet)
 
 
-def fallen(robot: RobotParams, height: float, pitch: float, roll: float = 0.0) -> bool:
-    """Whether a centre-of-mass height [m], pitch and roll [rad] mean a fall; NaN does."""
-    least = FALL_HEIGHT * (robot.thigh_length + robot.calf_length)
-    return not (height > least and abs(pitch) < FALL_TILT and abs(roll) < FALL_TILT)
-
-
 def metrics(run: Trajectory, config: RunConfig) -> dict[str, Any]:
     """Flat metrics of an episode, the unit in the key."""
     steady = run.time >= SETTLE_TIME

@@ -8,20 +8,15 @@ planned it.
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from kjax.config import NoiseConfig, RunConfig
-from kjax.sim.noise import FORCES, normal_row, normal_rows
+from kjax.sim.noise import FORCES, normal_rows
 
 
 def force_deviation(noise: NoiseConfig) -> float:
     """Standard deviation of the added forces [N], 0 where noise is off."""
     return noise.force * noise.enabled
-
-
-def force_row(seed: Int[Array, ""], step: Int[Array, ""]) -> Float[Array, "4"]:
-    """Standard normal vector (front x, z, rear x, z) of the tick that begins at a physics step."""
-    return normal_row(seed, step, FORCES, 4)
 
 
 def force_noise(config: RunConfig, ticks: int) -> Float[np.ndarray, "ticks 4"]:

@@ -94,7 +94,7 @@ def normal_rows(seed: int, steps: np.ndarray, stream: int, count: int) -> np.nda
 
 def sensor_noise(config: RunConfig, steps: int, start: int = 0) -> np.ndarray:
     """Noise (steps, n) of an episode from step ``start`` on; n is 30, or 36 for a free base."""
-    scale = noise_scale(config.noise, config.sim.base)
+    scale = noise_scale(config.noise, config.sim.base).astype(np.float32)
     numbers = np.arange(start, start + steps)
     return normal_rows(config.seed, numbers, SENSORS, len(scale)) * scale
 

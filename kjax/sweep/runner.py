@@ -169,10 +169,10 @@ def build_engine(sweep: SweepConfig, config: RunConfig, threads: int | None = No
     if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
         raise ValueError("precision = 'float64' needs jax_enable_x64")
     if sweep.engine == "c":
-        from kjax.sim.batch_loop import BatchEngine
+        from kjax.sim.engines.mujoco_batch import BatchEngine
 
         return BatchEngine(config, torques=sweep.torques, threads=threads, dtype=dtype)
-    from kjax.sim.mjx_loop import MjxEngine
+    from kjax.sim.engines.mjx import MjxEngine
 
     return MjxEngine(config, torques=sweep.torques, dtype=dtype)
 

@@ -138,7 +138,7 @@ def record(scripts, monkeypatch, tmp_path):
             ticks, fell = np.full(len(configs), 20), np.zeros(len(configs), bool)
             return SimpleNamespace(interrupted=False, log=log, ticks=ticks, fell=fell)
 
-    monkeypatch.setattr("kjax.sim.batch_loop.BatchEngine", Engine)
+    monkeypatch.setattr("kjax.sim.engines.mujoco_batch.BatchEngine", Engine)
 
     def call(*, robots=3, kind="trot"):
         count.clear()

@@ -115,7 +115,7 @@ def test_what_a_step_did_is_measured_from_the_step_on(studies):
     args = SimpleNamespace(seeds=1, quick=True)
     case = studies.raw_steps.Case(gait="trot", base="planar", forces="rows")
     _, configs = next(studies.raw_steps.steps_of(case, 0.0, args))
-    model = studies.raw_steps._model("planar", "all")
+    model, _ = studies.raw_steps._scene("go1", "planar", "all")
     time = np.arange(0.0, 1.2, 0.005)
     x, qpos = np.zeros((len(time), 6)), np.zeros((len(time), model.nq))
     qpos[:, 1] = 1.0

@@ -14,9 +14,9 @@ from kjax.legs.kinematics import leg_trig
 from kjax.legs.posture import stand_pose
 from kjax.robots import get_robot, robot_names
 from kjax.robots.robot import Robot
-from kjax.sim.batch_loop import BatchEngine
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import metrics
-from kjax.sim.mujoco_loop import build_simulation, simulate
 from kjax.sim.observe import find_addresses
 from kjax.sim.resolve import batch_spec
 from kjax.sim.scene import build_model
@@ -54,7 +54,7 @@ def at(model):
 
 @pytest.fixture(scope="module")
 def run(config):
-    return simulate(build_simulation(config))
+    return simulate(MujocoEngine(config))
 
 
 def test_its_numbers_are_those_of_its_model(model, at):
@@ -142,7 +142,7 @@ def test_the_batch_engine_walks_it_alike(run, config):
 def test_robots_differ_in_the_spec_of_a_batch(config):
     other = dataclasses.replace(config, robot="go1")
     assert batch_spec(config) != batch_spec(other)
-    with pytest.raises(ValueError, match=r"scene\.robot is .go1., the first one.s .toy_"):
+    with pytest.raises(ValueError, match=r"scene\.robot is .go1., the engine.s .toy_"):
         BatchEngine(config).run([config, other])
 
 

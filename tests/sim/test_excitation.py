@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, load_config
-from kjax.sim.batch_loop import BatchEngine
-from kjax.sim.excitation import force_noise, force_row, perturb
-from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.excitation import force_noise, perturb
+from kjax.sim.noise import FORCES, normal_row
 from kjax.sim.resolve import batch_spec
 
 SHORT = {
@@ -41,7 +42,7 @@ def test_noise_depends_on_the_seed_and_the_tick_and_has_the_size_asked_for():
     assert one.std(axis=0) == pytest.approx(12.0, rel=0.05)  # 3 sigma of 2,000 draws
     assert np.abs(np.corrcoef(one.T) - np.eye(4)).max() < 0.08
     np.testing.assert_array_equal(one[:60], force_noise(config(), 60))
-    row = force_row(jnp.asarray(5, jnp.int32), jnp.asarray(35, jnp.int32))  # tick 7 of 5 steps
+    row = normal_row(jnp.asarray(5), jnp.asarray(35), FORCES, 4)  # tick 7 of 5 steps
     np.testing.assert_allclose(one[7], 12.0 * np.asarray(row), rtol=1e-6)
     assert np.abs(force_noise(config(seed=6), 60) - one[:60]).max() > 1.0
 
@@ -49,10 +50,8 @@ def test_noise_depends_on_the_seed_and_the_tick_and_has_the_size_asked_for():
 def test_only_whether_forces_are_perturbed_is_compiled_in():
     off = {"noise.force": 0.0}
     none = {"noise.enabled": False}
-    for part in (batch_spec, simulation_key):
-        assert part(config()) == part(config(**{"noise.force": 3.0}))
-        assert part(config()) != part(config(**off))
-    assert simulation_key(config(**none)) == simulation_key(config(**off))
+    assert batch_spec(config()) == batch_spec(config(**{"noise.force": 3.0}))
+    assert batch_spec(config()) != batch_spec(config(**off))
     assert batch_spec(config(**none)) == batch_spec(config(**off, **none))
 
 
@@ -60,7 +59,7 @@ def test_only_whether_forces_are_perturbed_is_compiled_in():
 def test_both_loops_press_the_same_forces():
     two = [config(), config(**{"noise.force": 6.0, "seed": 9})]
     run = BatchEngine(two[0], dtype=np.float64, threads=1).run(two)
-    simulation, calm = build_simulation(two[0]), build_simulation(config(**{"noise.force": 0.0}))
+    simulation, calm = MujocoEngine(two[0]), MujocoEngine(config(**{"noise.force": 0.0}))
     for robot, own in enumerate(two):
         alone = simulate(simulation, own)
         # 1e-2 N: equal forces, but the plans of two engines differ by their rounding
@@ -77,7 +76,7 @@ def test_both_loops_press_the_same_forces():
 def test_noise_that_is_off_changes_nothing():
     base = load_config(RunConfig, None, {"duration": 0.2, "noise.enabled": False})
     noisy = dataclasses.replace(base, noise=dataclasses.replace(base.noise, force=9.0))
-    simulation = build_simulation(base)
+    simulation = MujocoEngine(base)
     jax.tree.map(
         np.testing.assert_array_equal,
         simulate(simulation, noisy).qpos,

@@ -13,6 +13,6 @@ def test_only_the_note_that_warp_is_not_installed_is_kept_back():
 
 
 def test_importing_what_uses_mjx_prints_nothing():
-    code = "import kjax.sim.mjx_loop, kjax.sim.sensitivity; from mujoco import mjx; mjx.step"
+    code = "import kjax.sim.engines.mjx, kjax.sim.sensitivity; from mujoco import mjx; mjx.step"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")

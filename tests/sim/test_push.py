@@ -5,27 +5,42 @@ import numpy as np
 import pytest
 
 from kjax import RunConfig, load_config
-from kjax.config import ConfigError, PushConfig
+from kjax.config import ConfigError
 from kjax.robots import go1
-from kjax.sim.mujoco_loop import build_simulation, simulate
-from kjax.sim.push import push_force
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.resolve import push_at, resolve_scene
 
 DT = 0.001
 
 
+def forces(steps, dt=DT, **keys):
+    """Force (steps, 3) of each physics step."""
+    config = {f"push.{key}": value for key, value in keys.items()}
+    config |= {
+        "sim.base": "free",
+        "sim.sim_dt": dt,
+        "leg.act_dt": 5 * dt,
+        "lmpc.control_dt": 5 * dt,
+    }
+    _, episode = resolve_scene(load_config(RunConfig, None, config))
+    return push_at(episode, np.arange(steps)[:, None])
+
+
 def test_the_force_of_each_push_adds_up_to_its_impulse():
-    config = PushConfig(times=(0.1, 0.25), forward=(3.0, -1.0), lateral=2.0, duration=0.07)
-    force = push_force(config, np.arange(500) * DT, DT, np)
+    force = forces(500, times=[0.1, 0.25], forward=[3.0, -1.0], lateral=2.0, duration=0.07)
     np.testing.assert_allclose(force.sum(axis=0) * DT, [2.0, 4.0, 0.0], atol=1e-12)
     acting = np.flatnonzero(force[:, 0])
     assert acting.tolist() == [*range(100, 170), *range(250, 320)]
 
 
-def test_times_that_carry_rounding_give_the_same_steps_in_single_precision():
-    config = PushConfig(times=(0.3,), forward=1.0)
-    time = np.cumsum(np.full(500, DT, np.float32)) - np.float32(DT)  # as an engine counts
-    force = push_force(config, time, DT, np)
-    assert np.flatnonzero(force[:, 0]).tolist() == list(range(300, 400))
+def test_pushes_that_overlap_add_up_and_a_held_tick_gets_its_mean():
+    force = forces(500, times=[0.1, 0.15], forward=[1.0, 2.0], duration=0.1)
+    np.testing.assert_allclose(force[[99, 100, 149, 150, 199, 200, 249, 250], 0],
+                               [0.0, 10.0, 10.0, 30.0, 30.0, 20.0, 20.0, 0.0])  # fmt: skip
+    keys = {"push.times": [0.102], "push.forward": 1.0, "push.duration": 0.1}
+    _, episode = resolve_scene(load_config(RunConfig, None, keys))
+    # Two of five steps before it begins: 3/5 of 10 N.
+    assert push_at(episode, 100, 5)[0] == pytest.approx(6.0)
 
 
 def test_momentum_of_the_floating_robot_changes_by_the_impulse_whatever_its_joints_do():
@@ -38,8 +53,7 @@ def test_momentum_of_the_floating_robot_changes_by_the_impulse_whatever_its_join
     data.qpos[3], data.qpos[7:] = 1.0, np.tile([0.0, 0.9, -1.8], 4)
     dt = model.opt.timestep
     steps = round(0.1 / dt) + 20
-    config = PushConfig(times=(0.0,), forward=3.0, lateral=-1.0, duration=0.1)
-    for force in push_force(config, np.arange(steps) * dt, dt, np):
+    for force in forces(steps, dt, times=[0.0], forward=3.0, lateral=-1.0, duration=0.1):
         data.ctrl[:] = 0.5  # internal torques
         data.xfrc_applied[model.body("trunk").id, :3] = force
         mujoco.mj_step(model, data)
@@ -60,7 +74,7 @@ def test_a_push_speeds_the_walking_robot_up_and_it_walks_on():
     chosen |= {"noise.enabled": False}
     calm = load_config(RunConfig, None, chosen)
     pushed = load_config(RunConfig, None, chosen | {"push.times": [0.5], "push.forward": 4.0})
-    simulation = build_simulation(calm)
+    simulation = MujocoEngine(calm)
     runs = [simulate(simulation, config) for config in (calm, pushed)]
     np.testing.assert_array_equal(runs[0].x[:501], runs[1].x[:501])
     gain = runs[1].x[600, 3] - runs[0].x[600, 3]

@@ -11,13 +11,12 @@ from kjax.params import condense
 from kjax.resolve import resolve
 from kjax.robots import go1
 from kjax.sim import resolve as scene
-from kjax.sim.observe import find_addresses
-from kjax.sim.push import push_force
+from kjax.sim.closed_loop import Sensed, build_closed_loop
 from kjax.sim.scene import build_model
-from kjax.sim.walk import Sensed, build_walk
 
 # Where 0.9 times the default, or the next of a list of words, is no value.
 VALUES = {
+    "robot": "toy_robot:ROBOT",
     "srb.mass": 11.0,
     "srb.inertia": 0.3,
     "srb.feet_front": [0.2, -0.25],
@@ -55,6 +54,7 @@ VALUES = {
 }
 # What a controller or a scene is compiled for.
 STATIC = {
+    "robot",
     "lmpc.control_dt", "lmpc.model_dt", "lmpc.horizon", "lmpc.caution", "lmpc.solver",
     "lmpc.warm_start", "lmpc.tolerance", "lmpc.max_iterations", "leg.act_dt",
     "koopman.model", "koopman.dictionary", "koopman.order", "koopman.fourier_count",
@@ -105,15 +105,18 @@ def program(config):
     """What ``plan`` and ``act`` compute, as text."""
     model = build_model(go1.ROBOT, config.sim, visual=False)
     spec = scene.batch_spec(config)
-    walk = build_walk(spec, model, find_addresses(go1.ROBOT, model).actuator, held=False)
+    loop = build_closed_loop(go1.ROBOT, spec, model, held=False)
     tables = condense(*resolve(config, go1.PARAMS))
     episode = jax.tree.map(lambda leaf: leaf[0], scene.stack_episodes([config]))
     sensed = Sensed(np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nsensordata))
-    state = jax.eval_shape(walk.init, tables, episode, sensed)
-    step = np.int32(0)
-    plan = jax.make_jaxpr(walk.plan)(tables, episode, state, step, sensed)
-    act = jax.make_jaxpr(walk.act)(tables, episode, state, step, sensed)
-    return str(plan), str(act)
+
+    def walk(tables, episode, step, sensed):
+        noise = loop.noise(episode, step)
+        state = loop.init(tables, noise, sensed)
+        state, log = loop.plan(tables, episode.origin, state, noise, sensed)
+        return loop.act(tables, state, noise, sensed), log
+
+    return str(jax.make_jaxpr(walk)(tables, episode, np.int32(0), sensed))
 
 
 def test_every_key_either_makes_another_program_or_none():
@@ -148,15 +151,17 @@ def test_nodes_of_a_cycle_make_another_program():
     assert specs[0] == scene.batch_spec(load_config(RunConfig, None, cycle | data))
 
 
-def test_pushes_are_those_of_a_single_run():
+def test_pushes_of_a_batch_are_filled_up_with_none():
     configs = [
         load_config(RunConfig, None, {"push.times": times, "push.forward": 3.0})
         for times in ([0.01], [0.02, 0.05], [])
     ]
     stacked = scene.stack_episodes(configs)
     for step in range(300):
-        wanted = [push_force(c.push, np.array(step * 1e-3), 1e-3, np) for c in configs]
-        np.testing.assert_allclose(scene.push_at(stacked, step), wanted, atol=1e-12)
+        # 3 N s in 0.1 s each, alone or together.
+        began = [[0.01], [0.02, 0.05], []]
+        wanted = [30.0 * sum(t <= step * 1e-3 + 1e-9 < t + 0.1 for t in ts) for ts in began]
+        np.testing.assert_allclose(scene.push_at(stacked, step)[:, 0], wanted, atol=1e-12)
     # over a control tick: the mean, so that the impulse stays
     held = sum(scene.push_at(stacked, step, 5) * 5e-3 for step in range(0, 300, 5))
     np.testing.assert_allclose(held[:, 0], [3.0, 6.0, 0.0], rtol=1e-12)

@@ -8,9 +8,9 @@ import pytest
 
 from kjax.config import RunConfig, load_config
 from kjax.sim import free_base
-from kjax.sim.batch_loop import BatchEngine
+from kjax.sim.engines.mujoco import MujocoEngine, requests, simulate
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import initial_state, metrics
-from kjax.sim.mujoco_loop import build_simulation, requests, simulate
 
 WALK = {
     "duration": 1.2,
@@ -71,7 +71,7 @@ def test_it_walks_up_and_down_a_slope(slope):
         "leg.swing_height": 0.2347,
     }
     config = load_config(RunConfig, None, keys)
-    result = metrics(simulate(build_simulation(config), seed=1), config)
+    result = metrics(simulate(MujocoEngine(config), seed=1), config)
     assert not result["fell"]
     assert result["crossed"]
     assert result["pitch_max_deg"] < 12.0
@@ -80,7 +80,7 @@ def test_it_walks_up_and_down_a_slope(slope):
 @pytest.fixture(scope="module")
 def simulation():
     keys = {"command.times": [0.0, 0.5], "command.v_x": [0.0, 0.3], "sim.base": "planar"}
-    return build_simulation(load_config(RunConfig, None, keys))
+    return MujocoEngine(load_config(RunConfig, None, keys))
 
 
 FAULTS = {
@@ -105,13 +105,14 @@ def test_contact_flags_that_lie_do_not_throw_the_robot(simulation, name):
         seen[at.foot_force] = FAULTS[name](seen[at.foot_force], rng)
         return np.r_[data.qpos, data.qvel, seen, noise]
 
-    state, pitch = simulation.init(sense(), requests(config)), []
+    program = simulation.program(config)
+    state, pitch = program.init(sense(), requests(config)), []
     for step in range(3000):
         sensed = sense()
         if step % 5 == 0:
-            state, _ = simulation.plan(state, sensed)
-        state, torque = simulation.act(state, sensed)
-        data.ctrl[at.actuator.reshape(-1)] = torque
+            state, _ = program.plan(state, sensed)
+        state, torque = program.act(state, sensed)
+        data.ctrl[:] = torque
         mujoco.mj_step(model, data)
         pitch.append(free_base.attitude(data.qpos)[1])
     assert data.subtree_com[model.body("trunk").id, 2] > 0.25

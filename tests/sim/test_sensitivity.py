@@ -6,7 +6,7 @@ import pytest
 from mujoco import mjx
 
 from kjax import RunConfig, load_config
-from kjax.sim import mjx_loop
+from kjax.sim.engines import mjx as mjx_engine
 from kjax.sim.episode import initial_state
 from kjax.sim.sensitivity import build_sensitivity
 
@@ -17,7 +17,7 @@ CONFIG = load_config(
 
 @pytest.fixture(scope="module")
 def model():
-    made = mjx_loop.build_model(CONFIG)
+    made = mjx_engine.build_model(CONFIG)
     # C's own differences need a solver that has converged.
     made.opt.iterations, made.opt.ls_iterations, made.opt.tolerance = 100, 100, 0.0
     return made
@@ -76,10 +76,10 @@ def test_reverse_mode_is_what_mjx_cannot(model, standing):
 def test_a_model_whose_derivative_would_be_wrong_is_refused(model):
     free = load_config(RunConfig, None, {"sim.contacts": "feet", "sim.base": "free"})
     with pytest.raises(ValueError, match="no free or ball joint"):
-        build_sensitivity(mjx_loop.build_model(free), 1)
+        build_sensitivity(mjx_engine.build_model(free), 1)
     with pytest.raises(ValueError, match="steps must be at least 1"):
         build_sensitivity(model, 0)
-    elliptic = mjx_loop.build_model(CONFIG)
+    elliptic = mjx_engine.build_model(CONFIG)
     elliptic.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     with pytest.raises(ValueError, match="pyramidal"):
         build_sensitivity(elliptic, 1)

@@ -8,8 +8,8 @@ from kjax.config import RunConfig, SimConfig, TerrainConfig, load_config
 from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim import terrain
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.episode import initial_state
-from kjax.sim.mujoco_loop import build_simulation, simulate
 from kjax.sim.observe import find_addresses
 from kjax.sim.scene import build_model
 
@@ -160,7 +160,7 @@ def test_heights_follow_the_ground_under_the_stance_feet():
         "sim.base": "planar",
     }
     config = load_config(RunConfig, None, common)
-    simulation = build_simulation(config)
+    simulation = MujocoEngine(config)
     original = initial_state(config, simulation.model)
     lifted = original[0].copy()
     lifted[:2] += 1.0, rise
@@ -169,7 +169,7 @@ def test_heights_follow_the_ground_under_the_stance_feet():
         return lifted, original[1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kjax.sim.mujoco_loop.initial_state", start)
+        patch.setattr("kjax.sim.engines.mujoco.initial_state", start)
         run = simulate(simulation)
     assert not run.fell
     # 5 mm: what is left of the droop under the legs' own weight

@@ -10,8 +10,8 @@ from mujoco.mjx._src import math as mjx_math
 
 from kjax import RunConfig, load_config
 from kjax.robots import go1
-from kjax.sim import mjx_loop
-from kjax.sim.batch_loop import BatchEngine
+from kjax.sim.engines import mjx as mjx_engine
+from kjax.sim.engines.mujoco_batch import BatchEngine
 
 COMMON = {
     "sim.base": "planar",
@@ -48,14 +48,14 @@ def engine(configs):
     """
 
     def converging(config):
-        spec = mjx_loop.build_spec(go1.ROBOT, config.sim, config.terrain, visual=False)
+        spec = mjx_engine.build_spec(go1.ROBOT, config.sim, config.terrain, visual=False)
         spec.option.iterations = spec.option.ls_iterations = 50
         spec.option.tolerance, spec.option.ls_tolerance = 1e-15, 1e-6
         return spec.compile()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mjx_loop, "build_model", converging)
-        return mjx_loop.MjxEngine(configs[0], dtype=np.float64)
+        patch.setattr(mjx_engine, "build_model", converging)
+        return mjx_engine.MjxEngine(configs[0], dtype=np.float64)
 
 
 def closest_segment_point(a, b, point):
@@ -98,8 +98,8 @@ def test_three_tenths_of_a_second_of_trot_agree(both):
 @pytest.mark.slow
 def test_the_batch_lay_on_both_devices():
     assert jax.local_device_count() == 2  # see conftest; on one device nothing would be tested
-    assert len(mjx_loop._sharding(4).device_set) == 2
-    assert mjx_loop._sharding(3) is None
+    assert len(mjx_engine._sharding(4).device_set) == 2
+    assert mjx_engine._sharding(3) is None
 
 
 @pytest.mark.slow
@@ -132,4 +132,4 @@ def test_other_seeds_and_worlds_do_not_compile_again(engine, both, configs):
 
 def test_mjx_refuses_what_it_cannot_simulate():
     with pytest.raises(ValueError, match=r"sim\.contacts"):
-        mjx_loop.build_model(RunConfig())
+        mjx_engine.build_model(RunConfig())

@@ -8,9 +8,9 @@ import pytest
 
 from kjax.config import RunConfig, load_config
 from kjax.robots import go1
-from kjax.sim.batch_loop import BatchEngine, scene_models
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.engines.mujoco_batch import BatchEngine, scene_models
 from kjax.sim.episode import initial_state, metrics
-from kjax.sim.mujoco_loop import build_simulation, simulate, simulation_key
 from kjax.sim.observe import find_addresses
 
 pytestmark = pytest.mark.slow
@@ -82,12 +82,9 @@ def test_physics_is_that_of_single_robots_to_the_last_bit(held, held_recording, 
 
 
 def test_closed_loops_are_those_of_single_runs(recording, configs):
-    simulations = {}
+    single = MujocoEngine(configs[0])
     for i, config in enumerate(configs):
-        fixed = simulation_key(config)
-        if fixed not in simulations:
-            simulations[fixed] = build_simulation(config)
-        alone = simulate(simulations[fixed], config)
+        alone = simulate(single, config)
         assert not alone.fell
         # 1e-6: equal algorithms; a batch sums in another order, and contacts amplify that.
         np.testing.assert_allclose(recording.qpos[:, i], alone.qpos[::5], atol=1e-6)
@@ -107,9 +104,10 @@ def test_closed_loops_are_those_of_single_runs(recording, configs):
 
 def test_held_torques_walk_like_those_of_every_step(recording, held_recording):
     assert not held_recording.fell.any()
-    for i in range(len(OWN)):
-        # the same place within a centimetre after 0.6 s
-        assert abs(recording.log.x[-1, i, 0] - held_recording.log.x[-1, i, 0]) < 0.01
+    apart = np.abs(recording.log.x[-1, :, 0] - held_recording.log.x[-1, :, 0])
+    # The place after 0.6 s: over 12 seeds at most 1 mm, but for the robot at 0.3 m/s that meets its
+    # block (7 to 15 mm) and the loaded one, whose torques come a tick late (11 mm).
+    assert (apart < [0.002, 0.02, 0.002, 0.015, 0.002]).all()
 
 
 def test_a_robot_that_falls_leaves_its_neighbours_as_they_are(held, held_recording, configs):
@@ -126,13 +124,13 @@ def test_a_robot_that_falls_leaves_its_neighbours_as_they_are(held, held_recordi
 
 def test_numbers_that_are_none_end_one_robot_only(held, held_recording, configs, monkeypatch):
     """A state that is not a number, from the first tick on, is a fall."""
-    from kjax.sim import batch_loop
+    from kjax.sim.engines import mujoco_batch
 
     def start(config, model):
         qpos, qvel = initial_state(config, model)
         return (qpos * np.nan if config.seed == 1 else qpos), qvel
 
-    monkeypatch.setattr(batch_loop, "initial_state", start)
+    monkeypatch.setattr(mujoco_batch, "initial_state", start)
     other = held.run(configs)
     assert other.fell.tolist() == [False, True, False, False, False]
     assert other.ticks[1] == 1
@@ -140,7 +138,7 @@ def test_numbers_that_are_none_end_one_robot_only(held, held_recording, configs,
 
 
 def test_it_says_which_config_does_not_fit(engine, held, configs):
-    with pytest.raises(ValueError, match=r"configs\[1\] belongs to another batch"):
+    with pytest.raises(ValueError, match=r"configs\[1\] needs another engine"):
         engine.run([configs[0], load_config(RunConfig, None, COMMON | {"lmpc.horizon": 7})])
     with pytest.raises(ValueError, match=r"configs\[1\]\.duration is 1\.0 s"):
         engine.run([configs[0], dataclasses.replace(configs[0], duration=1.0)])

@@ -19,17 +19,13 @@ from jaxtyping import Array, Float
 from kjax.config import RunConfig
 from kjax.params import Tables
 from kjax.robots import get_robot
-from kjax.sim.batch_loop import (
-    OnProgress,
-    Torques,
-    require_one_batch,
-    scene_models,
-    ticks_of,
-)
+from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop, delayed_torque
+from kjax.sim.engines.contract import OnProgress, Torques, require_one_batch, ticks_of
+from kjax.sim.engines.mujoco_batch import scene_models
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses
-from kjax.sim.recording import Recording
+from kjax.sim.recording import Recording, recording_of_ticks
 from kjax.sim.resolve import (
     EpisodeParams,
     batch_spec,
@@ -39,7 +35,6 @@ from kjax.sim.resolve import (
     stack_tables,
 )
 from kjax.sim.scene import build_spec
-from kjax.sim.walk import Sensed, TickLog, WalkState, build_walk
 
 _PIECE = 50  # control ticks of one compiled call; between two of them Ctrl-C and progress
 
@@ -50,7 +45,6 @@ class MjxTick(NamedTuple):
     qpos: Float[Array, "nq"]
     qvel: Float[Array, "nv"]
     torque: Float[Array, "12"]
-    alive: Array
     log: TickLog
 
 
@@ -58,7 +52,7 @@ class MjxState(NamedTuple):
     """What is carried: MJX's data, the robot's state, torques under way (D, nu), steps done."""
 
     data: Any
-    walk: WalkState
+    walk: LoopState
     under_way: Float[Array, "D nu"]
     step: Array
 
@@ -81,7 +75,7 @@ class MjxEngine:
     Attributes:
       spec: what all configs have in common.
       model: the C model that MJX's was made from.
-      torques: see ``batch_loop.BatchEngine``.
+      torques: see ``engines.mujoco_batch.BatchEngine``.
       traces: how often the program has been traced.
     """
 
@@ -110,7 +104,7 @@ class MjxEngine:
         self._impl = impl
         robot = get_robot(config.robot)
         self._at = find_addresses(robot, self.model)
-        self._walk = build_walk(robot, self.spec, self.model, held=torques == "held")
+        self._loop = build_closed_loop(robot, self.spec, self.model, held=torques == "held")
         self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
         per_act = round(config.leg.act_dt / config.sim.sim_dt)
         # Physics steps that share a torque.
@@ -147,19 +141,19 @@ class MjxEngine:
                 pieces.append(jax.device_get(jax.tree.map(lambda a, n=count: a[:n], piece)))
                 if on_progress is not None:
                     on_progress((done + count) * len(configs), ticks * len(configs))
-                if not pieces[-1].alive[-1].any():
+                if not pieces[-1].log.alive[-1].any():
                     break
         except KeyboardInterrupt:
             interrupted = True
             if not pieces:
                 raise
         record = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
-        alive = np.asarray(record.alive)
+        alive = np.asarray(record.log.alive)
         fell = ~alive[-1]
         legs, sign = self._at.actuator.reshape(-1), self._at.sign.reshape(-1)
-        return Recording(
-            configs=list(configs),
-            dt=self.spec.controller.control_dt,
+        return recording_of_ticks(
+            configs,
+            self.spec.controller.control_dt,
             ticks=np.where(fell, 1 + np.argmin(alive, axis=0), len(alive)),
             fell=fell,
             qpos=record.qpos,
@@ -237,7 +231,9 @@ class MjxEngine:
         )
         return MjxState(
             data=data,
-            walk=self._walk.init(tables, episode, _sensed(data)),
+            walk=self._loop.init(
+                tables, self._loop.noise(episode, jnp.zeros((), jnp.int32)), _sensed(data)
+            ),
             under_way=jnp.zeros((delays, self.model.nu), self.dtype),
             step=jnp.zeros((), jnp.int32),
         )
@@ -245,7 +241,7 @@ class MjxEngine:
     def _walk_piece(
         self, tables: Tables, own: dict[str, Array], episode: EpisodeParams, state: MjxState
     ) -> tuple[MjxState, MjxTick]:
-        model, walk, unit = self._mjx.replace(**own), self._walk, self._unit
+        model, loop, unit = self._mjx.replace(**own), self._loop, self._unit
         trunk = self._at.trunk
 
         def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
@@ -257,17 +253,12 @@ class MjxEngine:
                 lambda new, old: jnp.where(alive, new, old), _same_types(moved, data), data
             )
 
-        def delayed(under_way: Array, torque: Array, place: Array) -> tuple[Array, Array]:
-            count = under_way.shape[0]
-            if count == 1:
-                return under_way, torque
-            under_way = under_way.at[place % count].set(torque)
-            return under_way, under_way[(place - episode.delay // unit) % count]
-
         def act(carry: MjxState, _: None) -> tuple[MjxState, Array]:
             data, robot, under_way, at = carry
-            robot, torque = walk.act(tables, episode, robot, at, _sensed(data))
-            under_way, applied = delayed(under_way, torque, at // unit)
+            robot, torque = loop.act(tables, robot, loop.noise(episode, at), _sensed(data))
+            under_way, applied = delayed_torque(
+                under_way, torque, at // unit, episode.delay // unit
+            )
 
             def onward(data: Any, i: Array) -> tuple[Any, None]:
                 return physics(data, applied, at + i, robot.alive), None
@@ -280,10 +271,11 @@ class MjxEngine:
 
         def tick(carry: MjxState, _: None) -> tuple[MjxState, MjxTick]:
             data, robot, under_way, at = carry
-            robot, log = walk.plan(tables, episode, robot, at, _sensed(data))
+            noise = loop.noise(episode, at)
+            robot, log = loop.plan(tables, episode.origin, robot, noise, _sensed(data))
             carry = MjxState(data, robot, under_way, at)
             after, torques = jax.lax.scan(act, carry, None, length=self._per_tick // unit)
-            return after, MjxTick(data.qpos, data.qvel, torques[0], robot.alive, log)
+            return after, MjxTick(data.qpos, data.qvel, torques[0], log)
 
         return jax.lax.scan(tick, state, None, length=_PIECE)
 

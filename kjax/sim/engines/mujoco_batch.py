@@ -13,9 +13,8 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from copy import copy
-from dataclasses import fields
 from threading import Event
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,24 +25,19 @@ import numpy as np
 from kjax.config import RunConfig
 from kjax.params import Tables
 from kjax.robots import get_robot
+from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop
+from kjax.sim.engines.contract import OnProgress, Torques, require_one_batch, ticks_of
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import find_addresses
-from kjax.sim.recording import Recording, empty_log
+from kjax.sim.recording import Recording, empty_log, recording_of_ticks
 from kjax.sim.resolve import (
-    BatchSpec,
     EpisodeParams,
     batch_spec,
-    check_engine,
     push_at,
     stack_episodes,
     stack_tables,
 )
 from kjax.sim.scene import apply_scene, build_model
-from kjax.sim.walk import Sensed, TickLog, WalkState, build_walk
-
-Torques = Literal["every_step", "held"]
-# Called from time to time with the robot-ticks done and the robot-ticks in all.
-OnProgress = Callable[[int, int], None]
 
 _WAIT = 0.1  # s between two looks at the threads
 
@@ -57,9 +51,9 @@ class Calls(NamedTuple):
       then: the same without plan -> (state, torque).
     """
 
-    init: Callable[..., WalkState]
-    first: Callable[..., tuple[WalkState, Any, TickLog]]
-    then: Callable[..., tuple[WalkState, Any]]
+    init: Callable[..., LoopState]
+    first: Callable[..., tuple[LoopState, Any, TickLog]]
+    then: Callable[..., tuple[LoopState, Any]]
 
 
 class BatchEngine:
@@ -99,7 +93,7 @@ class BatchEngine:
         self.threads = _cores() if threads is None else threads
         robot = get_robot(config.robot)
         self.model = build_model(robot, config.sim, config.terrain, visual=False)
-        self._walk = build_walk(robot, self.spec, self.model, held=torques == "held")
+        self._loop = build_closed_loop(robot, self.spec, self.model, held=torques == "held")
         self._calls: dict[Any, Calls] = {}
 
     def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
@@ -144,9 +138,9 @@ class BatchEngine:
             np.concatenate(arrays, axis=1)[:, : len(configs)]
             for arrays in zip(*(d[2:] for d in done), strict=True)
         ]
-        return Recording(
-            configs=list(configs),
-            dt=self.spec.controller.control_dt,
+        return recording_of_ticks(
+            configs,
+            self.spec.controller.control_dt,
             ticks=parts[0][: len(configs)],
             fell=parts[1][: len(configs)],
             qpos=series[0],
@@ -162,18 +156,25 @@ class BatchEngine:
         leaves, tree = jax.tree.flatten(axes, is_leaf=lambda a: a is None)
         key = (tuple(leaves), tree)
         if key not in self._calls:
-            walk = self._walk
+            loop = self._loop
 
-            def both(tables: Any, episode: Any, state: Any, step: Any, sensed: Any) -> Any:
-                state, log = walk.plan(tables, episode, state, step, sensed)
-                state, torque = walk.act(tables, episode, state, step, sensed)
+            def init(tables: Any, episode: Any, sensed: Any) -> Any:
+                return loop.init(tables, loop.noise(episode, jnp.zeros((), jnp.int32)), sensed)
+
+            def first(tables: Any, episode: Any, state: Any, step: Any, sensed: Any) -> Any:
+                noise = loop.noise(episode, step)
+                state, log = loop.plan(tables, episode.origin, state, noise, sensed)
+                state, torque = loop.act(tables, state, noise, sensed)
                 return state, torque, log
 
+            def then(tables: Any, episode: Any, state: Any, step: Any, sensed: Any) -> Any:
+                return loop.act(tables, state, loop.noise(episode, step), sensed)
+
             self._calls[key] = Calls(
-                init=jax.jit(jax.vmap(walk.init, (axes, 0, 0))),
+                init=jax.jit(jax.vmap(init, (axes, 0, 0))),
                 # The old state is given up, so that what stays the same is not copied.
-                first=jax.jit(jax.vmap(both, (axes, 0, 0, None, 0)), donate_argnums=2),
-                then=jax.jit(jax.vmap(walk.act, (axes, 0, 0, None, 0)), donate_argnums=2),
+                first=jax.jit(jax.vmap(first, (axes, 0, 0, None, 0)), donate_argnums=2),
+                then=jax.jit(jax.vmap(then, (axes, 0, 0, None, 0)), donate_argnums=2),
             )
         return self._calls[key]
 
@@ -263,7 +264,7 @@ class _Group:
                 strict=True,
             ):
                 array[tick] = value
-            still = np.asarray(state.alive)
+            still = host.alive
             if not still[alive].all():
                 fallen = alive & ~still
                 self.fell_at[fallen], self.fell[fallen] = tick + 1, True
@@ -336,12 +337,6 @@ def _run_threads(groups: list[_Group], stop: Event, on_progress: OnProgress | No
     return interrupted
 
 
-def ticks_of(config: RunConfig) -> int:
-    """Control ticks of an episode."""
-    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    return -(-round(config.duration / config.sim.sim_dt) // per_tick)
-
-
 def scene_models(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.MjModel]:
     """A copy of the scene for each config's terrain, floor, friction, payload; equal ones once."""
     robot = get_robot(configs[0].robot)
@@ -355,34 +350,6 @@ def scene_models(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mu
             apply_scene(robot, made[key], config.sim, config.terrain)
         out.append(made[key])
     return out
-
-
-def require_one_batch(spec: BatchSpec, configs: Sequence[RunConfig], torques: str) -> None:
-    """Raise a ValueError that says which config does not fit into a batch."""
-    if not configs:
-        raise ValueError("configs must hold at least one config, got none")
-    for i, config in enumerate(configs):
-        if batch_spec(config) != spec:
-            raise ValueError(
-                f"configs[{i}] belongs to another batch: {_difference(batch_spec(config), spec)}"
-            )
-        if config.duration != configs[0].duration:
-            raise ValueError(
-                f"configs[{i}].duration is {config.duration} s, the first one's "
-                f"{configs[0].duration} s; one batch has one duration"
-            )
-        check_engine(config, torques=torques)
-
-
-def _difference(one: BatchSpec, first: BatchSpec) -> str:
-    """Where two specs differ."""
-    for part in ("scene", "controller"):
-        own, other = (getattr(spec, part) for spec in (one, first))
-        for entry in fields(own):
-            values = [getattr(spec, entry.name) for spec in (own, other)]
-            if values[0] != values[1]:
-                return f"{part}.{entry.name} is {values[0]!r}, the first one's {values[1]!r}"
-    return "it has another spec"
 
 
 def _rows(tables: Tables, axes: Any, rows: slice) -> Tables:
