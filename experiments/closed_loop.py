@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import ConfigError, RunConfig
-from kjax.episodes import Store, code_version, config_hash
+from kjax.runs.pool import Store, code_version, config_hash
 from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
 from kjax.sim.episode import SETTLE_TIME, Trajectory, metrics
 from kjax.sim.summary import summarise

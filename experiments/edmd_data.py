@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kjax import srb
 from kjax.config import KoopmanConfig, SrbConfig
+from kjax.controllers.rigid_body import own_body
+from kjax.dynamics import srb_planar
 from kjax.koopman import edmd, observables
 from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
-from kjax.rigid_body import own_body
 from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
@@ -22,7 +22,7 @@ PAPER = observables.paper(4)
 class Setting(NamedTuple):
     """What the data is drawn from: the trot of the Go1's rigid body in the default ranges."""
 
-    body: srb.SrbParams
+    body: srb_planar.SrbParams
     alpha: jax.Array
     ranges: SampleRanges
     rollouts: int
@@ -60,7 +60,7 @@ def numpy_draw(rng: np.random.Generator, here: Setting, count: int) -> tuple[np.
 
 
 def numpy_rollouts(
-    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
+    body: srb_planar.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
 ) -> np.ndarray:
     """Trajectories (rollouts, steps + 1, 6): all rollouts at once, by Runge-Kutta.
 
@@ -101,7 +101,7 @@ def _derivative(
 
 
 def numpy_loop(
-    body: srb.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
+    body: srb_planar.SrbParams, alpha: np.ndarray, x0: np.ndarray, inputs: np.ndarray, dt: float
 ) -> np.ndarray:
     """The same, one rollout and one step after the other."""
     states = np.empty((len(x0), inputs.shape[1] + 1, 6))

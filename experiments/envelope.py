@@ -25,8 +25,8 @@ from paper_results import CONFIGS, cycle
 
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, load_config
-from kjax.episodes import Run, Store, code_version, config_hash, open_runner
-from kjax.sim.bisection import bisect
+from kjax.runs.bisection import bisect
+from kjax.runs.pool import Run, Store, code_version, config_hash, open_runner
 
 SHARE = 0.95  # of the seeds that must pass
 SPEED = 0.2  # largest relative error of the mean speed

@@ -28,9 +28,9 @@ import numpy as np
 from prediction_models import MODELS
 
 from kjax import cli
-from kjax.batches import batch_key, run_batch
 from kjax.config import ConfigError, RunConfig, load_config
-from kjax.episodes import Store, code_version
+from kjax.runs.batches import batch_key, run_batch
+from kjax.runs.pool import Store, code_version
 from kjax.sim.intervals import median_interval
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"

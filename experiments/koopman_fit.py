@@ -14,10 +14,10 @@ import numpy as np
 
 from kjax import cli
 from kjax.config import FitStudyConfig
+from kjax.controllers.rigid_body import own_body
 from kjax.koopman.dataset import SampleRanges, ranges_from_config, shrink
 from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
-from kjax.koopman.validate import ErrorStatistics, prediction_errors, summarise
-from kjax.rigid_body import own_body
+from kjax.prediction.evaluation import ErrorStatistics, prediction_errors, summarise
 from kjax.robots import get_robot
 from kjax.types import MODE_ALPHA, STATE_NAMES, STATE_UNITS, Mode
 

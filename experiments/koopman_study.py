@@ -18,11 +18,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kjax import cli, srb
+from kjax import cli
 from kjax.config import SrbConfig
-from kjax.koopman import edmd, families, learned, observables, validate
+from kjax.controllers.rigid_body import own_body
+from kjax.dynamics import srb_planar
+from kjax.koopman import edmd, observables
 from kjax.koopman.dataset import SampleRanges, sample
-from kjax.rigid_body import own_body
+from kjax.prediction import evaluation, families, learned
 from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
@@ -38,7 +40,7 @@ RANGES = {
     "trot ranges": ((0.5, 0.1, 0.15, 0.5, 0.5, 1.0), (15.0, 20.0)),
     "bound ranges": ((0.5, 0.1, 0.4, 1.0, 1.0, 3.0), (40.0, 62.0)),
 }
-Fitted = dict[str, tuple[families.Family, Any, srb.Plant, bool]]
+Fitted = dict[str, tuple[families.Family, Any, srb_planar.Plant, bool]]
 
 
 def main() -> None:
@@ -113,7 +115,7 @@ def study(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def ranges_of(
-    state_half: tuple[float, ...], force_half: tuple[float, float], body: srb.SrbParams
+    state_half: tuple[float, ...], force_half: tuple[float, float], body: srb_planar.SrbParams
 ) -> SampleRanges:
     """Sampling ranges about standing, forces about half the weight per leg."""
     centre = jnp.array([0.0, float(body.mass) * GRAVITY / 2] * 2)
@@ -128,7 +130,7 @@ def ranges_of(
 
 
 def fit_all(
-    args: argparse.Namespace, body: srb.SrbParams, alpha: Any, ranges: SampleRanges
+    args: argparse.Namespace, body: srb_planar.SrbParams, alpha: Any, ranges: SampleRanges
 ) -> Fitted:
     """Every model of a contact mode: family, numbers, plant it is judged on, frozen or not."""
     data = sample(
@@ -182,8 +184,8 @@ def fit_all(
 def judge(
     family: families.Family,
     numbers: Any,
-    plant: srb.Plant,
-    body: srb.SrbParams,
+    plant: srb_planar.Plant,
+    body: srb_planar.SrbParams,
     alpha: Any,
     starts: Any,
     forces: Any,
@@ -194,25 +196,25 @@ def judge(
 
     @jax.jit
     def errors(starts: Any, forces: Any) -> Any:
-        found = validate.model_errors(
+        found = evaluation.model_errors(
             family, numbers, plant, body, alpha, starts, forces, frozen=frozen
         )
         return found[:, :, at]
 
     found = errors(starts, forces)
-    statistics = jax.device_get(validate.summarise(found))
+    statistics = jax.device_get(evaluation.summarise(found))
     key = jax.random.key(0)
 
     def rms(rows: Any) -> Any:
         return jnp.sqrt(jnp.mean(rows**2, axis=(0, 1)))
 
-    low, high = jax.device_get(jax.jit(lambda e: validate.bootstrap(key, e, rms))(found))
+    low, high = jax.device_get(jax.jit(lambda e: evaluation.bootstrap(key, e, rms))(found))
     return {
         **{name: value for name, value in statistics._asdict().items()},
         "rms": np.asarray(rms(found)),
         "rms_low": low,
         "rms_high": high,
-        "quantiles": np.asarray(validate.quantiles(found)),
+        "quantiles": np.asarray(evaluation.quantiles(found)),
         "max_velocity": statistics.max[:, VELOCITY].max(axis=1),
         "observables": family.size,
     }

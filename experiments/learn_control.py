@@ -20,10 +20,11 @@ import numpy as np
 
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig, load_config
-from kjax.koopman import edmd, families, learned, storage
+from kjax.controllers.resolve import resolve
+from kjax.controllers.rigid_body import own_body
+from kjax.koopman import edmd
 from kjax.koopman.dataset import ranges_from_config, sample
-from kjax.resolve import resolve
-from kjax.rigid_body import own_body
+from kjax.prediction import families, learned, storage
 from kjax.robots import get_robot
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine

@@ -19,7 +19,7 @@ from prediction_models import MODELS, residual
 
 from kjax import cli
 from kjax.config import Gaits, RunConfig, load_config
-from kjax.episodes import code_version, config_hash
+from kjax.runs.pool import code_version, config_hash
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from kjax.config import RunConfig, load_config
+from kjax.controllers.walkable import build_gaits
 from kjax.gait import Gait
-from kjax.walkable import build_gaits
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

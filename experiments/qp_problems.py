@@ -9,11 +9,12 @@ import mujoco
 import numpy as np
 from tqdm import tqdm
 
-from kjax import planning, qp
+from kjax import qp
 from kjax.config import RunConfig, load_config
-from kjax.controller import build_controller
+from kjax.controllers import planning
+from kjax.controllers.controller import build_controller
+from kjax.controllers.resolve import controller_spec
 from kjax.mpc import lmpc, multiphase
-from kjax.resolve import controller_spec
 from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
 

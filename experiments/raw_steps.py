@@ -26,10 +26,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from kjax import cli
-from kjax.batches import batch_key, run_batch
 from kjax.config import CommandConfig, RunConfig, load_config
-from kjax.episodes import Store, code_version
 from kjax.robots import get_robot
+from kjax.runs.batches import batch_key, run_batch
+from kjax.runs.pool import Store, code_version
 from kjax.sim.contacts import body_contact
 from kjax.sim.episode import Trajectory
 from kjax.sim.intervals import median_interval, wilson

@@ -21,9 +21,9 @@ from koopman_fit import fit_study, save_figure
 from paper_results import CONFIGS, EXPERIMENTS, RMSE, Experiment, Row, base_config, cycle, episodes
 
 from kjax import cli
-from kjax.batches import batch_key, run_batch
 from kjax.config import ConfigError, FitStudyConfig, load_config
-from kjax.episodes import Run, Store, code_version, config_hash, open_runner
+from kjax.runs.batches import batch_key, run_batch
+from kjax.runs.pool import Run, Store, code_version, config_hash, open_runner
 from kjax.sim.intervals import median_interval, paired_difference, wilson
 from kjax.sim.series import Series, load_series, save_series
 from kjax.sim.summary import summarise, tracking_floor

@@ -54,8 +54,8 @@ def main() -> None:
     barrier = start_processes(args)
     process, processes = jax.process_index(), jax.process_count()
 
-    from kjax.sweep.runner import run_sweep
-    from kjax.sweep.store import StoreError
+    from kjax.runs.sweeps.runner import run_sweep
+    from kjax.runs.sweeps.store import StoreError
 
     clock = time.perf_counter()
     try:

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig
-from kjax.episodes import code_version, config_hash
+from kjax.runs.pool import code_version, config_hash
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.summary import summarise

@@ -25,10 +25,15 @@ from prediction_models import MODELS as MODEL_KEYS
 from prediction_models import residual
 from whole_body_recordings import CONFIGS, DT, KINDS, kept, record
 
-from kjax import cli, srb
+from kjax import cli
 from kjax.config import Gaits, RunConfig, SrbConfig, load_config
-from kjax.koopman import open_loop, storage, whole_body
-from kjax.koopman.features import (
+from kjax.controllers.resolve import fit_models
+from kjax.controllers.rigid_body import own_body
+from kjax.controllers.walkable import build_gaits, contact_problems
+from kjax.dynamics import srb_planar
+from kjax.prediction import storage
+from kjax.prediction.build import build_family, model_spec
+from kjax.prediction.features import (
     Features,
     affine,
     clock,
@@ -36,13 +41,10 @@ from kjax.koopman.features import (
     history,
     touchdown,
 )
-from kjax.koopman.prediction import build_family, model_spec
-from kjax.koopman.transitions import Episode, Transitions, split, transitions
-from kjax.resolve import fit_models
-from kjax.rigid_body import own_body
 from kjax.robots import get_robot
+from kjax.sysid import open_loop, whole_body
+from kjax.sysid.transitions import Episode, Transitions, split, transitions
 from kjax.types import Mode
-from kjax.walkable import build_gaits, contact_problems
 
 HORIZONS = {"25ms": 5, "50ms": 10}  # ticks
 HELD_OUT, TUNE = 0.3, 0.2 / 0.7  # of all episodes, of those left
@@ -252,7 +254,7 @@ def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str
 def _choose(
     fitted: Transitions,
     tuned: Transitions,
-    body: srb.SrbParams,
+    body: srb_planar.SrbParams,
     features: Features,
     landing: open_loop.Landing | None,
     everywhere: bool,
@@ -286,9 +288,9 @@ def _choose(
     return best[1], best[2], best[0]
 
 
-def _body() -> srb.SrbParams:
+def _body() -> srb_planar.SrbParams:
     config = own_body(SrbConfig(), get_robot().params)
-    return srb.SrbParams(
+    return srb_planar.SrbParams(
         mass=jnp.asarray(config.mass), inertia=jnp.asarray(config.inertia), feet=jnp.zeros((2, 2))
     )
 
@@ -314,7 +316,7 @@ def _within_stance(config: RunConfig) -> tuple[RunConfig, np.ndarray]:
 
 def _errors(
     views: open_loop.Windows,
-    body: srb.SrbParams,
+    body: srb_planar.SrbParams,
     fit: whole_body.Fit | None,
     features: Features | None,
     landing: open_loop.Landing | None,

@@ -9,8 +9,8 @@ import numpy as np
 
 from kjax import cli
 from kjax.config import RunConfig, load_config, to_dict
-from kjax.episodes import code_version
-from kjax.koopman.transitions import Episode
+from kjax.runs.pool import code_version
+from kjax.sysid.transitions import Episode
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 DT = 0.005  # s, control tick of all these configs

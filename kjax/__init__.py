@@ -8,15 +8,18 @@ The core imports jax, numpy and pydantic only; ``kjax.sim`` needs the extra ``si
 """
 
 from kjax.config import ConfigError, RunConfig, load_config
-from kjax.control_loop import ControlLoop
-from kjax.controller import Controller, build_controller
-from kjax.observation import check_observation
-from kjax.params import ControllerParams, Tables, condense
-from kjax.resolve import resolve
+from kjax.controllers.control_loop import ControlLoop
+from kjax.controllers.controller import Controller, build_controller
+from kjax.controllers.observation import check_observation
+from kjax.controllers.params import ControllerParams, Tables, condense
+from kjax.controllers.resolve import resolve
+from kjax.moved import tell_of_moves
 from kjax.spec import ControllerSpec
 from kjax.types import Command, JointCommand, Leg, Mode, Observation
 
 __version__ = "0.1.0"
+
+tell_of_moves()
 
 _MOVED = {"build_params": "resolve(config, robot), then condense(spec, params)"}
 

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from kjax.koopman.storage import resolve
+from kjax.prediction.storage import resolve
 from kjax.robots import get_robot
 
 # Config keys that name a file whose content a result depends on.

@@ -1,7 +1,7 @@
 """What shapes a controller's compiled program; all else is data in ``ControllerParams``.
 
 Two controllers share a compilation exactly when their specs are equal. A spec is made by
-``kjax.resolve``; it is hashable, so it may be a static argument or a key.
+``kjax.controllers.resolve``; it is hashable, so it may be a static argument or a key.
 """
 
 from dataclasses import dataclass

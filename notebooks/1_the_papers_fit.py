@@ -24,9 +24,10 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from kjax.config import KoopmanConfig, SrbConfig  # noqa: E402
-from kjax.koopman import edmd, families, observables, validate  # noqa: E402
+from kjax.controllers.rigid_body import own_body  # noqa: E402
+from kjax.koopman import edmd, observables  # noqa: E402
 from kjax.koopman.dataset import ranges_from_config, sample, shrink  # noqa: E402
-from kjax.rigid_body import own_body  # noqa: E402
+from kjax.prediction import evaluation, families  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
 from kjax.types import MODE_ALPHA, STATE_NAMES, Mode  # noqa: E402
 
@@ -72,10 +73,10 @@ def errors_of(model, scale):
     starts = sample(jax.random.key(2), body, alpha, here, rollouts=50, steps=1, dt=DT).states[:, 0]
     forces = sample(jax.random.key(3), body, alpha, here, rollouts=50, steps=50, dt=DT).inputs
     family = families.linear(dictionary, DT)
-    return validate.model_errors(family, model, "body", body, alpha, starts, forces)
+    return evaluation.model_errors(family, model, "body", body, alpha, starts, forces)
 
 
-judge = jax.jit(lambda model, scale: validate.summarise(errors_of(model, scale)))
+judge = jax.jit(lambda model, scale: evaluation.summarise(errors_of(model, scale)))
 statistics = judge(model, 1.0)
 fig, axes = plt.subplots(1, 4, figsize=(13, 3), layout="constrained")
 for ax, name in zip(axes, ("mean", "variance", "std", "max"), strict=True):

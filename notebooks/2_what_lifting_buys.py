@@ -21,9 +21,10 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from kjax.config import KoopmanConfig, SrbConfig  # noqa: E402
-from kjax.koopman import edmd, families, observables, validate  # noqa: E402
+from kjax.controllers.rigid_body import own_body  # noqa: E402
+from kjax.koopman import edmd, observables  # noqa: E402
 from kjax.koopman.dataset import ranges_from_config, sample  # noqa: E402
-from kjax.rigid_body import own_body  # noqa: E402
+from kjax.prediction import evaluation, families  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
 from kjax.types import MODE_ALPHA, Mode  # noqa: E402
 
@@ -67,7 +68,7 @@ worst = {}
 fig, ax = plt.subplots(figsize=(7, 4), layout="constrained")
 for name, (family, numbers, plant) in models.items():
     errors = jax.jit(
-        lambda s, f, family=family, numbers=numbers, plant=plant: validate.model_errors(
+        lambda s, f, family=family, numbers=numbers, plant=plant: evaluation.model_errors(
             family, numbers, plant, body, alpha, s, f
         )
     )(starts, forces)

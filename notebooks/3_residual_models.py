@@ -19,14 +19,15 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from kjax import RunConfig, load_config, srb  # noqa: E402
+from kjax import RunConfig, load_config  # noqa: E402
 from kjax.config import SrbConfig  # noqa: E402
-from kjax.koopman import open_loop, whole_body  # noqa: E402
-from kjax.koopman.features import affine, clock_history  # noqa: E402
-from kjax.koopman.transitions import Episode, split, transitions  # noqa: E402
-from kjax.rigid_body import own_body  # noqa: E402
+from kjax.controllers.rigid_body import own_body  # noqa: E402
+from kjax.dynamics import srb_planar  # noqa: E402
+from kjax.prediction.features import affine, clock_history  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
 from kjax.sim.engines.mujoco_batch import BatchEngine  # noqa: E402
+from kjax.sysid import open_loop, whole_body  # noqa: E402
+from kjax.sysid.transitions import Episode, split, transitions  # noqa: E402
 
 DT, ROBOTS = 0.005, 12
 
@@ -79,7 +80,9 @@ data = transitions(episodes, dt=DT, sole=float(get_robot().params.foot_radius))
 train, test = split(np.arange(ROBOTS), share=0.33)
 fitted, held = (data.rows(np.isin(data.episode, own)) for own in (train, test))
 config = own_body(SrbConfig(), get_robot().params)
-body = srb.SrbParams(jnp.asarray(config.mass), jnp.asarray(config.inertia), jnp.zeros((2, 2)))
+body = srb_planar.SrbParams(
+    jnp.asarray(config.mass), jnp.asarray(config.inertia), jnp.zeros((2, 2))
+)
 models = {"affine": affine, "with clock and last force": clock_history}
 fits = {
     name: whole_body.fit(fitted, body, dt=DT, features=features, steps=5)

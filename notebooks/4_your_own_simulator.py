@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 
 from kjax import RunConfig, load_config
-from kjax.controller import build_controller
-from kjax.params import condense, with_params
-from kjax.resolve import resolve
+from kjax.controllers.controller import build_controller
+from kjax.controllers.params import condense, with_params
+from kjax.controllers.resolve import resolve
 from kjax.robots import get_robot
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import build_observe, find_addresses

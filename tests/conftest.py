@@ -33,7 +33,7 @@ if given is None:
 
 # Shapes and dtypes of annotated arguments are checked in tests only, so before kjax is imported.
 CHECKED = (
-    "kjax.srb",
+    "kjax.dynamics.srb_planar",
     "kjax.koopman",
     "kjax.qp",
     "kjax.mpc",
@@ -42,7 +42,7 @@ CHECKED = (
 )
 install_import_hook(CHECKED, "beartype.beartype")
 
-from kjax import srb
+from kjax.dynamics import srb_planar
 from kjax.koopman import dataset, edmd, observables
 from kjax.robots import go1
 from kjax.types import MODE_ALPHA, Leg
@@ -53,7 +53,8 @@ DT = 1e-3  # s, step of the shared snapshots
 # The files that take longest, first: a worker that gets one last would leave the other idle.
 LONGEST = (
     "test_mjx", "test_notebooks", "test_tune", "test_whole_body", "test_free_base",
-    "test_sensitivity", "test_runner", "test_loop", "test_excitation", "test_closed_loop",
+    "test_sensitivity", "test_runner", "test_loop", "test_excitation", "test_mujoco",
+    "test_mujoco_batch", "test_closed_loop",
     "test_reproduce", "test_solvers", "test_rows",
 )  # fmt: skip
 
@@ -90,7 +91,7 @@ def dtype(request):
 @pytest.fixture(scope="session")
 def body():
     """A rigid body much like the Go1, float64."""
-    return srb.SrbParams(
+    return srb_planar.SrbParams(
         mass=jnp.asarray(12.7),
         inertia=jnp.asarray(0.39),
         feet=jnp.asarray([[0.19, -0.25], [-0.18, -0.26]]),

@@ -1,5 +1,6 @@
 """The wheel that users install."""
 
+import importlib
 import subprocess
 import sys
 import zipfile
@@ -7,6 +8,7 @@ import zipfile
 import pytest
 
 import kjax
+from kjax.moved import MOVED
 
 
 @pytest.mark.slow
@@ -31,3 +33,14 @@ def test_a_public_name_that_has_gone_gives_the_new_one():
     with pytest.raises(ImportError, match=r"kjax\.build_params has gone: use resolve\(config"):
         from kjax import build_params  # noqa: F401
     assert not hasattr(kjax, "nothing_of_that_name")
+
+
+def test_a_module_that_has_moved_gives_the_new_one():
+    for old, new in MOVED.items():
+        with pytest.raises(ImportError, match=rf"^{old} has moved: import {new}$"):
+            importlib.import_module(old)
+        assert importlib.util.find_spec(new) is not None
+    with pytest.raises(ImportError, match=r"kjax\.sweep has moved: import kjax\.runs\.sweeps"):
+        importlib.import_module("kjax.sweep.runner")
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("kjax.nothing_of_that_name")

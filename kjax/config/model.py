@@ -67,7 +67,7 @@ class KoopmanConfig:
     model: Literal[
         "linear", "srb_hover", "srb", "planted", "exact", "bilinear", "residual", "learned"
     ] = "linear"
-    """Kind of prediction model, see kjax.koopman.families; the paper's is linear. All but it
+    """Kind of prediction model, see kjax.prediction.families; the paper's is linear. All but it
     and srb_hover are linearised at every tick where the robot is [-]."""
     file: str = ""
     """Fitted model (.npz): of whole_body.py for residual, of learn_control.py for learned [-]."""

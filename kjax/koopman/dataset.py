@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from kjax import srb
 from kjax.config import DatasetConfig
+from kjax.dynamics import srb_planar
 from kjax.types import INPUT_DIM, STATE_DIM
 
 _PIECE = 256  # rollouts that are integrated side by side
@@ -71,7 +71,7 @@ def shrink(ranges: SampleRanges, scale: Float[Array, ""]) -> SampleRanges:
 
 def sample(
     key: PRNGKeyArray,
-    params: srb.SrbParams,
+    params: srb_planar.SrbParams,
     alpha: Float[Array, "2"],
     ranges: SampleRanges,
     *,
@@ -103,7 +103,7 @@ def sample(
     inputs = jnp.repeat(inputs, hold, axis=1)[:, :steps]
 
     def one(x0: Array, inputs: Array, feet: Array) -> Array:
-        return srb.rollout(params._replace(feet=feet), alpha, x0, inputs, dt)
+        return srb_planar.rollout(params._replace(feet=feet), alpha, x0, inputs, dt)
 
     # Many rollouts in pieces that stay in the cache.
     if rollouts > 4 * _PIECE:

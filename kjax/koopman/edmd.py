@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from kjax import srb
 from kjax.config import KoopmanConfig, SrbConfig
+from kjax.dynamics import srb_planar
 from kjax.koopman import regression
 from kjax.koopman.checks import check_snapshots, require_dataset, require_rows, require_steps
 from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
-from kjax.koopman.families import BilinearModel
-from kjax.koopman.models import LinearModel
+from kjax.koopman.models import BilinearModel, LinearModel
 from kjax.koopman.observables import (
     STATE_ROWS,
     Dictionary,
@@ -210,7 +209,7 @@ def build_dictionary(config: DictionarySpec | KoopmanConfig) -> Dictionary:
     )
 
 
-def srb_params(config: SrbConfig) -> srb.SrbParams:
+def srb_params(config: SrbConfig) -> srb_planar.SrbParams:
     """Body parameters, the same in every contact mode: stacked over ``types.Mode``.
 
     Args:
@@ -224,7 +223,7 @@ def srb_params(config: SrbConfig) -> srb.SrbParams:
 
 def stack_bodies(
     mass: float, inertia: float, feet: Sequence[tuple[Point, Point]] | np.ndarray | Array
-) -> srb.SrbParams:
+) -> srb_planar.SrbParams:
     """Body parameters with a leading axis.
 
     Args:
@@ -233,7 +232,7 @@ def stack_bodies(
       feet: (n, 2, 2) front and rear contact points (x, z), body frame [m].
     """
     count = len(feet)
-    return srb.SrbParams(
+    return srb_planar.SrbParams(
         mass=jnp.full(count, mass, float),
         inertia=jnp.full(count, inertia, float),
         feet=jnp.asarray(feet, float),
@@ -241,7 +240,7 @@ def stack_bodies(
 
 
 def fit_modes(
-    body: srb.SrbParams,
+    body: srb_planar.SrbParams,
     config: KoopmanConfig,
     key: PRNGKeyArray,
     *,
@@ -267,7 +266,7 @@ def fit_modes(
     require_dataset(data, dictionary.size + INPUT_DIM + (8 if vary_feet else 0))
     limits = ranges_from_config(data, vary_feet=vary_feet) if ranges is None else ranges
 
-    def one(key: Array, alpha: Array, body: srb.SrbParams) -> tuple[LinearModel, FitReport]:
+    def one(key: Array, alpha: Array, body: srb_planar.SrbParams) -> tuple[LinearModel, FitReport]:
         snapshots = sample(
             key,
             body,

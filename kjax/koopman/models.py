@@ -28,6 +28,27 @@ class LinearModel(NamedTuple):
     B_feet: Float[Array, "4 N 4"]
 
 
+class BilinearModel(NamedTuple):
+    """z+ = A z + sum_i z_i B[i] u + sum_k r_k B_feet[k] u.
+
+    Attributes:
+      A: (N, N) transition.
+      B: (N, N, 4) input map of each observable; that of the constant, B[0], is the linear one.
+      B_feet: (4, N, 4) change of B[0] per metre of each contact coordinate, as in ``LinearModel``.
+    """
+
+    A: Float[Array, "N N"]
+    B: Float[Array, "N N 4"]
+    B_feet: Float[Array, "4 N 4"]
+
+    def step(
+        self, z: Float[Array, "N"], u: Float[Array, "4"], feet: Float[Array, "2 2"]
+    ) -> Float[Array, "N"]:
+        """Lifted state one step later."""
+        moved = self.A @ z + jnp.einsum("inm,i,m->n", self.B, z, u)
+        return moved + jnp.einsum("k,knm,m->n", feet.reshape(4), self.B_feet, u)
+
+
 def input_map(model: LinearModel, feet: Float[Array, "2 2"]) -> Float[Array, "N 4"]:
     """B(r) for contact points ``feet`` (2, 2), body frame [m]."""
     return model.B + jnp.tensordot(feet.reshape(4), model.B_feet, axes=1)

@@ -8,8 +8,26 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.legs import kinematics
-from kjax.observation import standing
-from kjax.types import RobotParams
+from kjax.types import Observation, RobotParams
+
+
+def standing(joint_pos: Float[Array, "4 3"] | None = None) -> Observation:
+    """What is measured of a robot that stands still and level on all feet.
+
+    Args:
+      joint_pos: (4, 3) of its joints; a common crouch where not given [rad].
+    """
+    if joint_pos is None:
+        joint_pos = jnp.tile(jnp.array([0.0, 0.9, -1.8]), (4, 1))
+    return Observation(
+        base_pos=jnp.zeros(3),
+        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
+        base_vel=jnp.zeros(3),
+        base_ang_vel=jnp.zeros(3),
+        joint_pos=joint_pos,
+        joint_vel=jnp.zeros((4, 3)),
+        contact=jnp.ones(4, bool),
+    )
 
 
 def stand_pose(robot: RobotParams, com_height: float) -> tuple[float, np.ndarray]:

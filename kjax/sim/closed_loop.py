@@ -14,16 +14,16 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from kjax.controller import build_controller
+from kjax.controllers.controller import build_controller
+from kjax.controllers.params import Tables
+from kjax.controllers.state import ControllerState
 from kjax.legs.base import build_base
-from kjax.params import Tables
 from kjax.robots import Robot
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT
 from kjax.sim.excitation import perturb
 from kjax.sim.noise import FORCES, SENSORS, add_noise, noise_dim, normal_row
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.resolve import BatchSpec, EpisodeParams, SceneSpec
-from kjax.state import ControllerState
 from kjax.types import Observation, RobotParams
 
 

@@ -17,15 +17,15 @@ from kjax.config import (
 )
 from kjax.config.gaits import gait_setting
 from kjax.config.units import in_si
+from kjax.controllers.resolve import build_command
+from kjax.controllers.walkable import build_gaits
 from kjax.legs.base import build_base
 from kjax.legs.posture import stand_pose
-from kjax.resolve import build_command
 from kjax.robots import Robot, get_robot
 from kjax.sim import free_base
 from kjax.sim.observe import Observe, find_addresses
 from kjax.sim.scene import robot_addresses
 from kjax.types import COMMAND_NAMES, RobotParams
-from kjax.walkable import build_gaits
 
 # Height of the centre of mass over the leg's length; about the trunk lying on the ground.
 FALL_HEIGHT = 0.28

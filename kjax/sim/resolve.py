@@ -17,8 +17,8 @@ import numpy as np
 from kjax.config import (
     RunConfig,
 )
-from kjax.params import Tables, condense
-from kjax.resolve import build_command, controller_key, controller_spec, resolve
+from kjax.controllers.params import Tables, condense
+from kjax.controllers.resolve import build_command, controller_key, controller_spec, resolve
 from kjax.sim.episode import origin
 from kjax.sim.excitation import force_deviation
 from kjax.sim.noise import noise_scale

@@ -22,15 +22,15 @@ from kjax import gait
 from kjax.config import NoiseConfig, RunConfig
 from kjax.config.gaits import gait_setting
 from kjax.config.units import in_si
-from kjax.controller import build_controller
+from kjax.controllers.controller import build_controller
+from kjax.controllers.params import ControllerParams, condense
+from kjax.controllers.reference import next_clock
+from kjax.controllers.resolve import controller_spec
+from kjax.controllers.rigid_body import body_numbers
+from kjax.controllers.state import ControllerState
 from kjax.legs import swing
 from kjax.legs.kinematics import PlanarState
-from kjax.params import ControllerParams, condense
-from kjax.reference import next_clock
-from kjax.resolve import controller_spec
-from kjax.rigid_body import body_numbers
 from kjax.robots import get_robot
-from kjax.state import ControllerState
 from kjax.tuning import plant as body_plant
 from kjax.tuning.plant import PlantParams
 from kjax.types import COMMAND_NAMES, GRAVITY, STATE_DIM, Command, RobotParams

@@ -16,12 +16,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kjax import srb
+from kjax.dynamics import srb_planar
 from kjax.legs.base import View
 from kjax.legs.kinematics import PlanarState, inverse, leg_trig, moving_moments, planar_state
+from kjax.legs.posture import standing
 from kjax.legs.stance import stance_torque
 from kjax.legs.swing import joint_reference
-from kjax.observation import standing
 from kjax.types import RobotParams
 
 
@@ -92,7 +92,7 @@ def view(
     robot: RobotParams, com: Float[Array, "2"], x: Float[Array, "6"], feet: Float[Array, "4 2"]
 ) -> View:
     """The robot as the controller sees it, legs from feet (4, 2) in the world [m]."""
-    rotation = srb.planar_rotation(x[2])
+    rotation = srb_planar.planar_rotation(x[2])
     lever = rotation @ com
     base = x[:2] - lever
     _, _, trig = inverse(robot, (feet - base) @ rotation - robot.hip_pos[:, ::2])
@@ -207,8 +207,8 @@ def advance(
       force: (4, 2) force of each leg, body frame [N].
       dt: [s].
     """
-    body = srb.SrbParams(plant.mass, plant.inertia, jnp.zeros((2, 2), x.dtype))
+    body = srb_planar.SrbParams(plant.mass, plant.inertia, jnp.zeros((2, 2), x.dtype))
     stands = stance.astype(x.dtype)
-    return srb.rk4(
-        lambda x: srb.planted_dynamics(body, stands, contact, x, force.reshape(-1)), x, dt
+    return srb_planar.rk4(
+        lambda x: srb_planar.planted_dynamics(body, stands, contact, x, force.reshape(-1)), x, dt
     )

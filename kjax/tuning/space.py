@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Array
 
 from kjax.config import Gaits, Overlay, RunConfig, Tunable, load_config, to_dict, tunable
-from kjax.koopman.families import BodyModel
-from kjax.params import ControllerParams, Fits, cast
-from kjax.resolve import fit_models, gather
-from kjax.rigid_body import body_numbers
+from kjax.controllers.params import ControllerParams, Fits, cast
+from kjax.controllers.resolve import fit_models, gather
+from kjax.controllers.rigid_body import body_numbers
+from kjax.prediction.families import BodyModel
 from kjax.robots import get_robot
 from kjax.types import RobotParams
 

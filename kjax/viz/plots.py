@@ -11,11 +11,11 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from kjax.config import RunConfig
+from kjax.controllers.walkable import build_gaits
 from kjax.sim import free_base
 from kjax.sim.episode import Trajectory, reference_height
 from kjax.sim.series import Series
 from kjax.types import JOINT_NAMES, Leg
-from kjax.walkable import build_gaits
 
 BLUE, RED, GREY, DARK = "#2b6cb0", "#c53030", "#a0aec0", "#2d3748"
 _LEG_COLOURS = ("#c53030", "#2b6cb0", "#dd6b20", "#2f855a")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax import srb
+from kjax.dynamics import srb_planar
 from kjax.koopman import edmd, observables
 
 
@@ -79,7 +79,7 @@ def test_rollouts_in_numpy_are_those_of_kjax(drawing, small):
     rng = np.random.default_rng(0)
     x0, inputs = drawing.numpy_draw(rng, small, 5)
     alpha = np.array([2.0, 1.0])  # no symmetry that hides a swap of the ends
-    roll = jax.vmap(lambda x, u: srb.rollout(small.body, jnp.asarray(alpha), x, u, small.dt))
+    roll = jax.vmap(lambda x, u: srb_planar.rollout(small.body, jnp.asarray(alpha), x, u, small.dt))
     wanted = np.asarray(jax.jit(roll)(x0, inputs))
     body = jax.tree.map(np.asarray, small.body)
     for rival in (drawing.numpy_rollouts, drawing.numpy_loop):

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from kjax.config import SweepConfig, load_config, to_dict
-from kjax.koopman import storage
+from kjax.prediction import storage
 from kjax.types import Mode
 
 MODELS = ("linear (the paper)", "SRB re-linearised")

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kjax.batches import batch_key
+from kjax.runs.batches import batch_key
 
 
 @pytest.fixture(scope="module")

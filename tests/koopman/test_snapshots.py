@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, SrbConfig
-from kjax.koopman import dataset, edmd, families, observables, prediction
+from kjax.controllers.rigid_body import own_body
+from kjax.koopman import dataset, edmd, observables
 from kjax.koopman.dataset import Snapshots
-from kjax.rigid_body import own_body
+from kjax.prediction import build, families
 from kjax.robots import go1
 from kjax.types import Mode
 
@@ -185,9 +186,7 @@ def test_a_config_with_too_few_samples_names_its_keys(model, columns):
     body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
     fit = {
         "linear": edmd.fit_modes,
-        "bilinear": partial(
-            prediction.build_prediction, modes=tuple(Mode), heights=(0.27,) * len(Mode)
-        ),
+        "bilinear": partial(build.build_prediction, modes=tuple(Mode), heights=(0.27,) * len(Mode)),
     }[model]
     with pytest.raises(ConfigError, match=rf"koopman\.dataset: rollouts 3 .* {columns} regressors"):
         fit(body, config, jax.random.key(0))

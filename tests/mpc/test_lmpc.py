@@ -9,21 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax import planning, srb
 from kjax.config import GaitConfig, Gaits, LmpcConfig, RunConfig
 from kjax.config.gaits import LIBRARY
 from kjax.config.units import in_si
+from kjax.controllers import planning
+from kjax.controllers.resolve import problem_settings
+from kjax.controllers.walkable import Problem
+from kjax.dynamics import srb_planar
 from kjax.koopman import models, observables
 from kjax.legs.kinematics import LegTrig, leg_trig
 from kjax.legs.posture import stand_pose
 from kjax.mpc import lmpc
 from kjax.mpc.limits import force_limits
 from kjax.qp import Status
-from kjax.resolve import problem_settings
 from kjax.robots import go1
 from kjax.spec import ControllerSpec
 from kjax.types import MODE_ALPHA, Mode
-from kjax.walkable import Problem
 
 DT = 1e-3  # s, step of the fitted models
 MASS = 12.7
@@ -289,7 +290,7 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
         mode = jnp.asarray(int(Mode.STAND), jnp.int32)
         plan = lmpc.solve_lmpc(bounded, mode, lift(x), reference, memory, SPEC)
         for _ in range(5):
-            x = srb.rk4_step(body, alpha, x, plan.plan[:4], DT)
+            x = srb_planar.rk4_step(body, alpha, x, plan.plan[:4], DT)
         memory = lmpc.LmpcMemory(plan=plan.plan, problem=mode, warm=plan.warm)
         return (x, memory), (x, plan.status)
 

@@ -10,11 +10,11 @@ from scipy.integrate import solve_ivp
 from kjax import gait
 from kjax.config import RunConfig, load_config
 from kjax.config.units import in_si
+from kjax.controllers.resolve import multiphase_params
+from kjax.controllers.walkable import build_gaits, cycle_nodes
 from kjax.mpc import multiphase
-from kjax.resolve import multiphase_params
 from kjax.robots import go1
 from kjax.types import GRAVITY, Leg
-from kjax.walkable import build_gaits, cycle_nodes
 
 COUNT = 15
 WEIGHT, LENGTH = float(go1.PARAMS.mass) * GRAVITY, 0.426  # N, m

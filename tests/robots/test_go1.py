@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kjax.config import LmpcConfig, SrbConfig
+from kjax.controllers.rigid_body import own_body
 from kjax.legs.posture import stand_pose
-from kjax.rigid_body import own_body
 from kjax.robots import go1
 from kjax.types import GRAVITY, JOINT_NAMES, Leg
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kjax.config import ConfigError, RunConfig, fields, load_config
-from kjax.params import condense
-from kjax.resolve import resolve
+from kjax.controllers.params import condense
+from kjax.controllers.resolve import resolve
 from kjax.robots import go1
 from kjax.sim import resolve as scene
 from kjax.sim.closed_loop import Sensed, build_closed_loop

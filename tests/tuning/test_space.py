@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kjax import RunConfig, load_config
-from kjax.resolve import resolve
+from kjax.controllers.resolve import resolve
 from kjax.robots import go1
 from kjax.tuning.space import TUNABLE, build_space, tuned_config
 

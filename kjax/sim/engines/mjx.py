@@ -17,7 +17,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from kjax.config import RunConfig
-from kjax.params import Tables
+from kjax.controllers.params import Tables
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop, delayed_torque
 from kjax.sim.engines.contract import OnProgress, Torques, require_one_batch, ticks_of

@@ -15,9 +15,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from kjax.config import RunConfig
+from kjax.controllers.params import Tables, condense, with_params
+from kjax.controllers.resolve import build_command, controller_key, resolve
 from kjax.files import file_hashes
-from kjax.params import Tables, condense, with_params
-from kjax.resolve import build_command, controller_key, resolve
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import LoopState, Noise, Sensed, TickLog, build_closed_loop
 from kjax.sim.engines.contract import OnProgress, require_one_spec, ticks_of

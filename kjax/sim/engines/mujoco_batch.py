@@ -23,7 +23,7 @@ import mujoco.batch
 import numpy as np
 
 from kjax.config import RunConfig
-from kjax.params import Tables
+from kjax.controllers.params import Tables
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop
 from kjax.sim.engines.contract import OnProgress, Torques, require_one_batch, ticks_of

@@ -1,0 +1,174 @@
+"""Parameters of a controller, and the tables that are condensed from them once, off line."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from kjax import gait
+from kjax.controllers.observation import is_concrete
+from kjax.koopman.models import LinearModel
+from kjax.legs import lateral, swing
+from kjax.mpc import multiphase
+from kjax.mpc.lmpc import LmpcTables, ModeSettings, build_tables
+from kjax.prediction.build import Prediction
+from kjax.spec import ControllerSpec
+from kjax.types import Command, RobotParams
+
+
+class Fits(NamedTuple):
+    """What is learned from data, of every contact mode of every gait (M of them).
+
+    Attributes:
+      model: linear EDMD models over one step of the data.
+      feet: (M, 2, 2) nominal contact points, body frame [m].
+      spread: (M, n_x) standard deviation of the one-step error of the model in use.
+      prediction: another prediction model, where the config names one.
+    """
+
+    model: LinearModel
+    feet: Float[Array, "M 2 2"]
+    spread: Float[Array, "M n_x"]
+    prediction: Prediction | None
+
+
+class ControllerParams(NamedTuple):
+    """All parameters of a controller; data, so any leaf may be batched or replaced.
+
+    Attributes:
+      robot: geometry and masses.
+      fits: prediction models, of the same.
+      modes: weights and bounds of the LMPC within a stance, of every contact mode of every gait.
+      problem: (G, P) which of these each phase of a gait is.
+      uncertainty_discount: how much less its uncertain steps weigh; not read where the spec does
+        not discount [-].
+      friction: mu of its friction rows; not read where the spec has none [-].
+      torque_fraction: part of the joint torque limits in its torque rows; likewise [-].
+      schedule: gaits.
+      gait_times: (K,) times at which a gait is asked for, the first one 0 [s].
+      gaits: (K,) index of the gait asked for then.
+      reference: (G, ramp levels, P, samples, 4) periodic motion of each gait; see
+        ``gait.reference``.
+      multiphase: LMPC over a gait cycle, for gaits that use it.
+      swing: swing settings.
+      lateral: regulator of roll, yaw and sideways motion; of no effect on the planar base.
+      command: what the robot is asked to do over time.
+      height: (G,) mean height of the centre of mass above the ground [m].
+      command_slew: largest rate of change of the reference velocity [m/s^2].
+      height_slew: the same of the reference height [m/s].
+      integral: (2, 2) integral action on velocity and pitch: its rates [1/s] and its limits
+        [m/s, rad].
+      position_slack: clamp of the position reference's lag [m].
+      hold_time: how long the last torque holds without a valid sample [s].
+      blind_damping: joint damping after that [N m s/rad].
+    """
+
+    robot: RobotParams
+    fits: Fits
+    modes: ModeSettings
+    problem: Int[Array, "G P"]
+    uncertainty_discount: Float[Array, ""]
+    friction: Float[Array, ""]
+    torque_fraction: Float[Array, ""]
+    schedule: gait.Schedule
+    gait_times: Float[Array, "K"]
+    gaits: Int[Array, "K"]
+    reference: Float[Array, "G levels P samples 4"]
+    multiphase: multiphase.MultiPhaseParams
+    swing: swing.SwingParams
+    lateral: lateral.LateralParams
+    command: Command
+    height: Float[Array, "G"]
+    command_slew: Float[Array, ""]
+    height_slew: Float[Array, ""]
+    integral: Float[Array, "2 2"]
+    position_slack: Float[Array, ""]
+    hold_time: Float[Array, ""]
+    blind_damping: Float[Array, ""]
+
+
+class Tables(NamedTuple):
+    """What a controller's functions take: its parameters, and what is condensed from them.
+
+    Attributes:
+      params: parameters; those that the LMPC's tables are condensed from (fits, modes,
+        uncertainty_discount) are not read any more.
+      lmpc: condensed problems within a stance, of every contact mode.
+    """
+
+    params: ControllerParams
+    lmpc: LmpcTables
+
+
+def condense(spec: ControllerSpec, params: ControllerParams, *, dtype: Any = None) -> Tables:
+    """Precompute what depends on the parameters alone.
+
+    The work is done in float64 whatever the caller's default, and the result is cast once; inside
+    ``jit``, ``grad`` or ``vmap`` it is done in the floating type of the traced parameters.
+
+    Args:
+      spec: of the controller.
+      params: from ``kjax.controllers.resolve``, or changed since.
+      dtype: floating type of the result; JAX's current default if ``None``.
+    """
+    if not isinstance(params, ControllerParams):
+        raise TypeError(f"params: wanted those of kjax.resolve, got {type(params).__name__}")
+    dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    if not is_concrete((params, jnp.zeros(()))):  # the latter is traced inside jit, whatever params
+        return cast(Tables(params, _condensed(spec, params)), dtype)
+    with jax.enable_x64(True):
+        tables = Tables(params, jax.device_get(_condensed(spec, jax.tree.map(_as_float64, params))))
+    return cast(tables, dtype)
+
+
+def with_params(tables: Tables, **changes: Any) -> Tables:
+    """Tables with other parameters that nothing is condensed from, e.g. ``command``.
+
+    Raises:
+      ValueError: for parameters that the LMPC's tables are condensed from.
+    """
+    params = tables.params
+    condensed = sorted({"fits", "modes", "uncertainty_discount"} & changes.keys())
+    if condensed:
+        raise ValueError(f"{', '.join(condensed)}: the tables are condensed from it; use condense")
+    # In the type that is there: else every function compiles again.
+    changes = {
+        name: jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), new, getattr(params, name))
+        for name, new in changes.items()
+    }
+    return tables._replace(params=params._replace(**changes))
+
+
+@partial(jax.jit, static_argnums=0)
+def _condensed(spec: ControllerSpec, params: ControllerParams) -> LmpcTables:
+    return build_tables(
+        params.fits.model,
+        params.modes,
+        steps=round(spec.model_dt / spec.model.dt),
+        horizon=spec.horizon,
+        feet=params.fits.feet,
+        spread=params.fits.spread,
+        discount=spec.discounts_uncertainty,
+        uncertainty_discount=params.uncertainty_discount,
+    )
+
+
+def _as_float64(leaf: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    return array.astype(float) if np.issubdtype(array.dtype, np.floating) else array
+
+
+def cast(tree: Any, dtype: Any) -> Any:
+    """Arrays on the device, floats in ``dtype``, integers as int32."""
+    return jax.tree.map(lambda leaf: _as(leaf, dtype), tree)
+
+
+def _as(leaf: Any, dtype: Any) -> Array:
+    """Leaf on the device: floats in ``dtype``, integers as int32, the rest as it is."""
+    kind = jnp.asarray(leaf).dtype
+    if jnp.issubdtype(kind, jnp.floating):
+        return jnp.asarray(leaf, dtype)
+    return jnp.asarray(leaf, jnp.int32) if jnp.issubdtype(kind, jnp.integer) else jnp.asarray(leaf)

@@ -1,0 +1,373 @@
+"""From a config to what a controller is made of: its spec (static) and its parameters (data)."""
+
+import warnings
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from math import inf
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from kjax import gait
+from kjax.config import CommandConfig, KoopmanConfig, Overlay, RunConfig
+from kjax.config.gaits import gait_setting, reachable_gaits
+from kjax.config.units import InSi, in_si
+from kjax.controllers.params import ControllerParams, Fits
+from kjax.controllers.rigid_body import body_numbers, levers, mean_force, own_body
+from kjax.controllers.walkable import (
+    Problem,
+    build_gaits,
+    check_walkable,
+    contact_problems,
+    cycle_nodes,
+)
+from kjax.gait.reference import SAMPLES, periodic_reference
+from kjax.koopman.edmd import Point, fit_modes, stack_bodies
+from kjax.legs import lateral, swing
+from kjax.mpc import multiphase
+from kjax.mpc.lmpc import ModeSettings
+from kjax.prediction.build import build_prediction, model_spec
+from kjax.prediction.evaluation import force_response_error
+from kjax.robots import get_robot
+from kjax.spec import ControllerSpec, CycleSpec
+from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
+
+
+def resolve(
+    config: RunConfig, robot: RobotParams | None = None
+) -> tuple[ControllerSpec, ControllerParams]:
+    """Spec and parameters of a controller; fits the Koopman models.
+
+    A fit whose response to forces is far from the rigid body's along the LMPC's horizon is warned
+    of.
+
+    Args:
+      config: of the run.
+      robot: parameters of the robot; those of ``config.robot`` if ``None``.
+
+    Returns:
+      What ``build_controller`` takes, and its parameters, NumPy arrays in float64: change or batch
+      them, then ``condense`` both to what the controller's functions take.
+
+    Raises:
+      ValueError: for a config that this robot cannot walk with, naming the key.
+    """
+    robot = get_robot(config.robot).params if robot is None else robot
+    spec = controller_spec(config)
+    check_walkable(config, robot)
+    with jax.enable_x64(True):
+        fits = fit_models(config, robot)
+        _warn_of_fits(config, robot, fits)
+        return spec, jax.device_get(gather(config, robot, fits))
+
+
+def controller_spec(config: RunConfig) -> ControllerSpec:
+    """The static choices of a config.
+
+    Raises:
+      ConfigError: for a file of a model that cannot be used.
+    """
+    lmpc, chosen = config.lmpc, config.multiphase
+    gaits = build_gaits(config)
+    nodes = int(cycle_nodes(gaits, config).sum(axis=1).max())
+    cycle = CycleSpec(nodes=nodes, tolerance=chosen.tolerance, max_iterations=chosen.max_iterations)
+    return ControllerSpec(
+        base=config.sim.base,
+        act_dt=config.leg.act_dt,
+        control_dt=lmpc.control_dt,
+        model_dt=lmpc.model_dt,
+        horizon=lmpc.horizon,
+        model=model_spec(config.koopman),
+        discounts_uncertainty=lmpc.caution > 0,
+        friction_rows=lmpc.friction < inf,
+        torque_rows=lmpc.torque_fraction < inf,
+        solver=lmpc.solver,
+        warm_start=lmpc.warm_start,
+        tolerance=lmpc.tolerance,
+        max_iterations=lmpc.max_iterations,
+        cycle=cycle if nodes else None,
+        gaits=tuple((len(one.phases), one.ramp_cycles) for one in gaits),
+        modes=tuple(problem.mode for problem in contact_problems(gaits, config)[0]),
+    )
+
+
+@lru_cache(maxsize=8192)
+def controller_key(config: RunConfig) -> Hashable:
+    """What ``resolve`` reads of a config, but for the command and the times of gaits.
+
+    Configs with the same key have the same parameters, but for these.
+    """
+    asked = replace(config.gait, times=tuple(map(float, range(len(config.gait.times)))))
+    return (
+        config.robot,
+        config.srb,
+        config.koopman,
+        config.lmpc,
+        asked,
+        config.gaits,
+        config.multiphase,
+        config.leg,
+        config.lateral,
+        config.sim.base,
+    )
+
+
+def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
+    """Fit the Koopman models of a config; call it in float64.
+
+    Configs that differ elsewhere, in weights or bounds, share one fit.
+    """
+    si = in_si(config, robot)
+    gaits = build_gaits(si)
+    problems, _ = contact_problems(gaits, si)
+    names = [gaits[problem.gait].name for problem in problems]
+    feet = tuple(_nominal_feet(si, robot, name) for name in names)
+    modes = tuple(problem.mode for problem in problems)
+    hover = si.koopman.model == "srb_hover"
+    heights = tuple(gait_setting(si, name, "body_height") if hover else 0.0 for name in names)
+    # What a file holds may have changed since.
+    fit = _fit.__wrapped__ if si.koopman.file else _fit
+    mass, inertia = (float(number) for number in body_numbers(si, robot))
+    return fit(mass, inertia, si.koopman, modes, feet, heights)
+
+
+def _nominal_feet(config: InSi, robot: RobotParams, name: str) -> tuple[Point, Point]:
+    """Contact points (x, z) of front and rear legs from the centre of mass, standing still [m]."""
+    own, height = config.gaits[name], gait_setting(config, name, "body_height")
+    if own.foothold_front is None or own.foothold_rear is None:
+        body = own_body(config.srb, robot, height)
+        assert body.feet_front is not None  # own_body filled them in
+        assert body.feet_rear is not None
+        return body.feet_front, body.feet_rear
+    sole = float(robot.foot_radius - height)
+    return (own.foothold_front, sole), (-own.foothold_rear, sole)
+
+
+@lru_cache(maxsize=32)
+def _fit(
+    mass: float,
+    inertia: float,
+    koopman: KoopmanConfig,
+    modes: tuple[Mode, ...],
+    feet: tuple[tuple[Point, Point], ...],
+    heights: tuple[float, ...],
+) -> Fits:
+    body = stack_bodies(mass, inertia, feet)
+    key = jax.random.key(koopman.dataset.seed)
+    model, report = _fit_modes(body, koopman, key, modes=modes)
+    if not bool(report.finite.all()):
+        raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
+    prediction = None
+    if koopman.model != "linear":
+        prediction = build_prediction(body, koopman, key, modes=modes, heights=heights)
+    spread = report.residual_rms if prediction is None else prediction.spread
+    return jax.device_get(Fits(model, body.feet, spread, prediction))
+
+
+def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
+    """Warn of a linear EDMD model that an LMPC over this horizon should not rely on."""
+    if config.koopman.model != "linear":
+        return
+    gaits = build_gaits(config)
+    walked = reachable_gaits(config.gaits, config.gait.names)
+    mass, inertia = (float(number) for number in body_numbers(config, robot))
+    bodies = jax.device_get(stack_bodies(mass, inertia, fits.feet))
+    duration = config.lmpc.model_dt * config.lmpc.horizon
+    for index, (g, mode) in enumerate(contact_problems(gaits, config)[0]):
+        if mode == Mode.FLIGHT or gaits[g].name not in walked:
+            continue
+        model, body = (jax.tree.map(lambda a, i=index: a[i], part) for part in (fits.model, bodies))
+        error = force_response_error(
+            model,
+            body,
+            MODE_ALPHA[mode],
+            steps=round(duration / config.koopman.dataset.dt),
+            duration=duration,
+        )
+        if error > 1.0:
+            warnings.warn(
+                f"koopman: over the LMPC's {duration:g} s the velocity that the fitted model of "
+                f"{gaits[g].name} ({mode.name.lower()}) predicts for a held force is {error:.1f} "
+                "times the rigid body's response away from it, so it may throw the robot over; try "
+                "fewer powers (koopman.order), more koopman.dataset.rollouts or another "
+                "koopman.dataset.seed",
+                stacklevel=3,
+            )
+
+
+def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> ControllerParams:
+    """Parameters from a config, or an ``Overlay`` with traced values, and its fits."""
+    si = in_si(config, robot)
+    gaits = build_gaits(si)
+    names = [one.name for one in gaits]
+    leg, sideways = si.leg, si.lateral
+    foresees = cycle_nodes(gaits, si).any(axis=1)
+    problems, index = contact_problems(gaits, si)
+
+    return ControllerParams(
+        robot=robot,
+        fits=fits,
+        modes=problem_settings(si, problems, names, mean_force(gaits, si, robot)),
+        problem=jnp.asarray(index),
+        uncertainty_discount=jnp.asarray(si.lmpc.caution, float),
+        friction=jnp.asarray(si.lmpc.friction, float),
+        torque_fraction=jnp.asarray(si.lmpc.torque_fraction, float),
+        schedule=gait.build_schedule(gaits),
+        gait_times=jnp.asarray(si.gait.times),
+        gaits=jnp.asarray([names.index(name) for name in si.gait.names]),
+        reference=_reference_tables(gaits, si, robot),
+        multiphase=multiphase_params(gaits, si, robot),
+        swing=swing.SwingParams(
+            apex=_column(si, names, "swing_height"),
+            velocity_gain=_column(si, names, "foothold_gain"),
+            offset=jnp.stack([_foothold_offset(robot, si.gaits[name]) for name in names]),
+            horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
+            hold_after=jnp.asarray(leg.hold_after),
+            reach_speed=jnp.asarray(leg.reach_speed),
+            kp=jnp.asarray([leg.abduction_kp, leg.swing_kp, leg.swing_kp]),
+            kd=jnp.asarray([leg.abduction_kd, leg.swing_kd, leg.swing_kd]),
+        ),
+        lateral=lateral.LateralParams(
+            roll=jnp.asarray([sideways.roll_kp, sideways.roll_kd]),
+            yaw=jnp.asarray([sideways.yaw_kp, sideways.yaw_kd]),
+            damping=jnp.asarray(sideways.sideways_kd),
+            weights=jnp.asarray(sideways.wrench_cost),
+            ridge=jnp.asarray(sideways.force_weight),
+            friction=jnp.minimum(
+                sideways.friction,
+                jnp.where(foresees, si.multiphase.friction, si.lmpc.friction),
+            ),
+            torque_fraction=jnp.minimum(
+                1.0,
+                jnp.where(foresees, si.multiphase.torque_fraction, si.lmpc.torque_fraction),
+            ),
+            foothold_gain=jnp.asarray(sideways.foothold_gain),
+        ),
+        command=build_command(si.command),
+        height=_column(si, names, "body_height"),
+        command_slew=jnp.asarray(si.lmpc.command_slew, float),
+        height_slew=jnp.asarray(si.lmpc.height_slew, float),
+        integral=jnp.stack(
+            [jnp.asarray(si.lmpc.integral_gains), jnp.asarray(si.lmpc.integral_limits)]
+        ),
+        position_slack=jnp.asarray(si.lmpc.position_slack),
+        hold_time=jnp.asarray(leg.hold_time),
+        blind_damping=jnp.asarray(leg.blind_kd),
+    )
+
+
+def build_command(command: CommandConfig) -> Command:
+    """The command of a config as arrays, NumPy in float64."""
+    columns = [getattr(command, name) or [0.0] * len(command.times) for name in COMMAND_NAMES]
+    values = np.stack([np.asarray(column, float) for column in columns], axis=-1)
+    return Command(np.asarray(command.times, float), values)  # type: ignore[arg-type]
+
+
+_fit_modes = jax.jit(fit_modes, static_argnames=("config", "modes"))
+
+
+def _column(config: InSi, names: Sequence[str], key: str) -> Array:
+    """One setting of several gaits, stacked."""
+    return jnp.stack([jnp.asarray(gait_setting(config, name, key), float) for name in names])
+
+
+def problem_settings(
+    config: InSi,
+    problems: Sequence[Problem],
+    names: Sequence[str],
+    mean_force: Float[Array, "G 2"],
+) -> ModeSettings:
+    """Weights and bounds of every problem: those of its gait.
+
+    Args:
+      config: of the run, in SI units.
+      problems: contact modes of the gaits.
+      names: of the gaits.
+      mean_force: (G, 2) F_z per front and rear leg that R penalises the distance from [N].
+    """
+    standing = np.repeat(MODE_ALPHA[[problem.mode for problem in problems]] > 0, 2, axis=1)
+
+    own = [names[problem.gait] for problem in problems]
+
+    def pair(x: Array, z: Array) -> Array:
+        return jnp.tile(jnp.stack([x, z], axis=-1), 2)
+
+    force = mean_force[np.array([problem.gait for problem in problems])]
+    hover = jnp.stack([jnp.zeros_like(force), force], axis=-1).reshape(len(problems), 4)
+    lower, upper = (
+        pair(sign * _column(config, own, "grf_x_max"), _column(config, own, f"grf_z_{end}"))
+        for sign, end in ((-1.0, "min"), (1.0, "max"))
+    )
+    return ModeSettings(
+        state_weights=_column(config, own, "Q"),
+        input_weights=jnp.tile(_column(config, own, "R")[:, None], 4),
+        lower=jnp.where(standing, lower, 0.0),
+        upper=jnp.where(standing, upper, 0.0),
+        input_reference=jnp.where(standing, hover, 0.0),
+    )
+
+
+def multiphase_params(
+    gaits: list[gait.Gait], config: InSi, robot: RobotParams
+) -> multiphase.MultiPhaseParams:
+    """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
+    chosen = config.multiphase
+    mass, inertia = body_numbers(config, robot)
+
+    names = [one.name for one in gaits]
+    ends = [levers(config.gaits[name], robot) for name in names]
+    feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in ends]
+    return multiphase.MultiPhaseParams(
+        nodes=jnp.asarray(cycle_nodes(gaits, config)),
+        state_weights=_column(config, names, "Q"),
+        input_weight=_column(config, names, "R"),
+        mass=jnp.asarray(mass),
+        inertia=jnp.asarray(inertia * chosen.inertia_scale),
+        friction=jnp.asarray(chosen.friction),
+        torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
+        force_x_max=_column(config, names, "grf_x_max"),
+        force_z=jnp.stack(
+            [_column(config, names, "grf_z_min"), _column(config, names, "grf_z_max")], axis=-1
+        ),
+        feet=jnp.stack(feet),
+        velocity_gain=_column(config, names, "foothold_gain"),
+        velocity_time=jnp.asarray(chosen.velocity_time),
+        height_time=jnp.asarray(chosen.height_time),
+    )
+
+
+def _reference_tables(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> Array:
+    """Periodic motion of every gait at every ramp level; zero where the reference is constant."""
+    mass, inertia = body_numbers(config, robot)
+    levels = 1 + max(g.ramp_cycles for g in gaits)
+    rows = jnp.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
+    for index, one in enumerate(gaits):
+        own = config.gaits[one.name]
+        if own.reference != "periodic":
+            continue
+        modes = [contact_mode(phase.stance) for phase in one.phases]
+        cycles = [
+            periodic_reference(
+                np.array(one.durations(min(level, one.ramp_cycles))),
+                modes,
+                *levers(own, robot),
+                mass,
+                inertia,
+                own.force_edge,
+            ).rows
+            for level in range(levels)
+        ]
+        rows = rows.at[index, :, : len(modes)].set(jnp.stack(cycles))
+    return rows
+
+
+def _foothold_offset(robot: RobotParams, own: Any) -> Array:
+    """Foothold of a gait ahead of the hip, standing still, for each leg [m]."""
+    if own.foothold_front is None:
+        return jnp.zeros(4)
+    wanted = [own.foothold_front] * 2 + [-own.foothold_rear] * 2
+    return jnp.stack([jnp.asarray(one, float) for one in wanted]) - robot.hip_pos[:, 0]

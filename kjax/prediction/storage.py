@@ -1,0 +1,206 @@
+"""Fitted models on disk: one .npz per model, its parameters stacked over contact modes."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kjax.config import ConfigError
+from kjax.koopman.models import BilinearModel
+from kjax.prediction.families import Past, Start
+from kjax.prediction.features import BY_NAME
+from kjax.prediction.learned import Layer, LearnedModel
+from kjax.types import INPUT_DIM, STATE_DIM, Mode
+
+_SUFFIX = ".npz"
+
+
+class Stored(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+      family: ``"residual"`` or ``"learned"``.
+      dt: step of the model [s].
+      numbers: W (M, 6, F) of a residual, or a ``LearnedModel``; a leading axis over ``Mode``.
+      spread: (M, 6) standard deviation of the one-step error [m, rad, m/s, rad/s].
+      features: that the weights of a residual belong to, a name of ``features.BY_NAME``.
+    """
+
+    family: str
+    dt: float
+    numbers: Any
+    spread: np.ndarray
+    features: str = "affine"
+
+
+def save(path: str | Path, stored: Stored) -> Path:
+    """Write a model whole or not at all; its directory must exist.
+
+    Args:
+      path: of the file; ``.npz`` is appended where it is missing, as ``load`` does.
+      stored: the model.
+
+    Returns:
+      The file that was written.
+    """
+    arrays: dict[str, Any] = {
+        "family": np.array(stored.family),
+        "dt": np.array(stored.dt),
+        "spread": np.asarray(stored.spread),
+    }
+    if stored.family == "residual":
+        arrays |= {"W": np.asarray(stored.numbers), "features": np.array(stored.features)}
+    elif stored.family == "learned":
+        model: LearnedModel = stored.numbers
+        for i, layer in enumerate(model.layers):
+            arrays[f"W_{i}"], arrays[f"b_{i}"] = np.asarray(layer.W), np.asarray(layer.b)
+        arrays |= {"A": np.asarray(model.head.A), "B": np.asarray(model.head.B)}
+        arrays["B_feet"] = np.asarray(model.head.B_feet)
+        arrays |= {"centre": np.asarray(model.centre), "scale": np.asarray(model.scale)}
+    else:
+        raise ValueError(f"family must be 'residual' or 'learned', got {stored.family!r}")
+    file = _with_suffix(path)
+    scratch = file.with_name(f".{file.name}.part{_SUFFIX}")
+    try:
+        np.savez(scratch, **arrays)
+        scratch.replace(file)
+    finally:
+        scratch.unlink(missing_ok=True)
+    return file
+
+
+def load(path: str | Path, family: str) -> Stored:
+    """Read a model of this family.
+
+    Args:
+      path: of the file, with or without ``.npz``.
+      family: ``"residual"`` or ``"learned"``.
+
+    Raises:
+      ConfigError: in one line that names the file and the fault: not there, not readable, not a
+        model's, of another family, or with an array that is missing, not real, not finite, or of
+        another shape than the family and the other arrays ask for.
+    """
+    file = resolve(path)
+    arrays = _read(file)
+    if family not in ("residual", "learned"):
+        raise ValueError(f"family must be 'residual' or 'learned', got {family!r}")
+    held = str(arrays["family"]) if _is_word(arrays.get("family")) else "no model"
+    if held != family:
+        raise _fault(file, f"holds {held[:40]}, wanted a {family} model")
+    try:
+        if family == "residual":
+            own = str(arrays["features"]) if "features" in arrays else "affine"
+            shapes = _residual_shapes(own)
+        else:
+            own = "affine"
+            shapes = _learned_shapes(arrays)
+        for name, shape in {"dt": (), "spread": (len(Mode), STATE_DIM), **shapes}.items():
+            _check_array(name, arrays[name], shape)
+    except KeyError as error:
+        raise _fault(file, f"lacks {error}") from None
+    except ValueError as error:
+        raise _fault(file, str(error)) from None
+    if family == "residual":
+        numbers: Any = arrays["W"]
+    else:
+        numbers = LearnedModel(
+            layers=tuple(Layer(arrays[f"W_{i}"], arrays[f"b_{i}"]) for i in range(_layers(arrays))),
+            head=BilinearModel(arrays["A"], arrays["B"], arrays["B_feet"]),
+            centre=arrays["centre"],
+            scale=arrays["scale"],
+        )
+    for name, least in (("dt", "above 0"), ("scale", "above 0"), ("spread", "of at least 0")):
+        values = arrays.get(name, np.ones(()))
+        if (values < 0).any() or (least == "above 0" and (values == 0).any()):
+            raise _fault(file, f"{name} holds {values.min():g}, wanted values {least}")
+    return Stored(family, float(arrays["dt"]), numbers, arrays["spread"], own)
+
+
+def resolve(path: str | Path) -> Path:
+    """The file that ``load`` reads for a path: the one that ``save`` writes, or the path itself."""
+    file = _with_suffix(path)
+    return file if file.exists() else Path(path)
+
+
+def _with_suffix(path: str | Path) -> Path:
+    path = Path(path)
+    if not path.name:
+        raise _fault(path, "is no file")
+    return path if path.name.endswith(_SUFFIX) else path.with_name(path.name + _SUFFIX)
+
+
+def _fault(file: Path, text: str) -> ConfigError:
+    return ConfigError(f"koopman.file: '{file}' {text}")
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """All arrays of an .npz."""
+    try:
+        with np.load(file, allow_pickle=False) as content:
+            # A member that is no array, such as text, comes as bytes.
+            return {k: v for k, v in content.items() if isinstance(v, np.ndarray)}
+    except (AttributeError, TypeError):  # a bare array is no context manager
+        raise _fault(file, "holds no model: it is one bare array (.npy)") from None
+    except OSError as error:
+        reason = error.strerror or str(error)
+    except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
+        reason = f"it is empty, cut off, damaged or no .npz ({error})"
+    raise ConfigError(f"koopman.file: cannot read '{file}': {reason.splitlines()[0]}")
+
+
+def _is_word(value: np.ndarray | None) -> bool:
+    return value is not None and value.shape == () and value.dtype.kind == "U"
+
+
+def _check_array(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Raise a ValueError that says what is wrong with an array of a model."""
+    if values.dtype.kind == "c":
+        raise ValueError(f"{name} holds complex numbers, wanted real ones")
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{name} holds values of type {values.dtype}, wanted real numbers")
+    if shape and values.ndim == len(shape) and len(values) != len(Mode):
+        text = f"{name} holds {len(values)} contact modes, wanted {len(Mode)}"
+        raise ValueError(text + ": fit it again, kjax had 5 before" * (len(values) == 5))
+    if values.shape != shape:
+        raise ValueError(f"{name} has shape {values.shape}, wanted {shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} holds numbers that are not finite")
+
+
+def _residual_shapes(features: str) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of a residual model with these features."""
+    if features not in BY_NAME:
+        raise ValueError(
+            f"holds weights of features '{features[:40]}', wanted one of {', '.join(BY_NAME)}"
+        )
+    x, u = jnp.zeros(STATE_DIM), jnp.zeros(INPUT_DIM)
+    phi = jax.eval_shape(BY_NAME[features], Start(x, jnp.zeros((2, 2))), x, u, Past(u, u))
+    return {"W": (len(Mode), STATE_DIM, phi.shape[0])}
+
+
+def _layers(arrays: Mapping[str, np.ndarray]) -> int:
+    return sum(name.startswith("W_") for name in arrays)
+
+
+def _learned_shapes(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of a learned model: every layer takes what the one before gives."""
+    modes, width = len(Mode), STATE_DIM - 1  # the network does not see p_x
+    shapes: dict[str, tuple[int, ...]] = {}
+    for i in range(max(_layers(arrays), 1)):
+        layer = arrays[f"W_{i}"].shape
+        if len(layer) != 3:
+            raise ValueError(f"W_{i} has shape {layer}, wanted (modes, out, in)")
+        shapes[f"W_{i}"], shapes[f"b_{i}"] = (modes, layer[1], width), (modes, layer[1])
+        width = layer[1]
+    N = 1 + STATE_DIM + width
+    return shapes | {
+        "A": (modes, N, N),
+        "B": (modes, N, N, INPUT_DIM),
+        "B_feet": (modes, 4, N, INPUT_DIM),
+        "centre": (modes, STATE_DIM),
+        "scale": (modes, STATE_DIM),
+    }

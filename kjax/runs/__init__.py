@@ -1,0 +1,1 @@
+"""Many episodes: workers, batches, sweeps; what is kept of them."""

@@ -1,0 +1,181 @@
+"""Run a sweep: chunk by chunk, on one process or several, and keep each chunk as it ends."""
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+from tqdm import tqdm
+
+from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dict
+from kjax.runs.pool import code_version, config_hash
+from kjax.runs.sweeps.grid import plan
+from kjax.runs.sweeps.store import Store, columns, lock, restart
+from kjax.sim.resolve import BatchSpec, batch_spec, check_engine
+
+Engine = Any  # BatchEngine or MjxEngine: run(configs, on_progress) -> Recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """Cases that walk together; all chunks of a sweep have one number of robots.
+
+    Attributes:
+      cases: their numbers in the plan.
+      configs: of the robots; the last one is repeated to fill the chunk.
+    """
+
+    cases: np.ndarray
+    configs: list[RunConfig]
+
+
+def chunks_of(cases: Sequence[RunConfig], size: int) -> list[Chunk]:
+    """Cases in chunks, in order; those of one chunk have one ``batch_spec`` and one duration."""
+    groups: dict[tuple[BatchSpec, float], list[int]] = {}
+    for number, config in enumerate(cases):
+        groups.setdefault((batch_spec(config), config.duration), []).append(number)
+    out = []
+    for numbers in groups.values():
+        own = min(size, len(numbers))
+        for first in range(0, len(numbers), own):
+            some = numbers[first : first + own]
+            filled = [*some, *[some[-1]] * (own - len(some))]
+            out.append(Chunk(cases=np.array(some), configs=[cases[i] for i in filled]))
+    return out
+
+
+def run_sweep(
+    sweep: SweepConfig,
+    file: Path,
+    folder: Path,
+    *,
+    threads: int | None = None,
+    process: int = 0,
+    processes: int = 1,
+    barrier: Callable[[str], None] | None = None,
+    fresh: bool = False,
+) -> xr.Dataset | None:
+    """Run what is missing of a sweep, and merge it.
+
+    Args:
+      sweep: its config.
+      file: that it came from.
+      folder: of its results.
+      threads: of the C engine; as many as cores if ``None``.
+      process: number of this process.
+      processes: number of processes that share the sweep; each runs every so-manieth chunk.
+      barrier: waits until all processes have come to the same name.
+      fresh: drop what the folder holds.
+
+    Returns:
+      The dataset, on process 0; ``None`` on others, and where Ctrl-C stopped it.
+
+    Raises:
+      ConfigError: for cases that are none.
+      StoreError: for a folder that cannot be used.
+      KeyboardInterrupt: on Ctrl-C; finished chunks are kept.
+    """
+    cases = plan(sweep, file)
+    for config in cases.cases:
+        try:
+            check_engine(config, engine=sweep.engine, torques=sweep.torques)
+        except ValueError as error:
+            raise ConfigError(f"{file}: {error}") from None
+    chunks = chunks_of(cases.cases, sweep.chunk)
+    meet = barrier or (lambda name: None)
+    with lock(folder, f"lock.{process}" if processes > 1 else "lock"):
+        if fresh and process == 0:
+            restart(folder)
+        meet("restarted")
+        spec = {
+            "sweep": to_dict(sweep),
+            "base": to_dict(load_config(RunConfig, file.parent / sweep.base)),
+            "cases": _hash_of(cases.cases),
+        }
+        if process == 0:
+            Store(folder, spec, code_version(), len(chunks))
+        meet("opened")
+        store = Store(folder, spec, code_version(), len(chunks))
+        todo = store.missing()
+        own = [number for number in todo if number % processes == process]
+        _run_chunks(sweep, store, chunks, own, len(todo), threads)
+        meet("finished")
+        if process > 0:
+            return None
+        return store.merge(cases, np.concatenate([chunk.cases for chunk in chunks]), spec)
+
+
+def _hash_of(cases: Sequence[RunConfig]) -> str:
+    """Hash of all cases and of the content of the files that they name."""
+    hashes = {config: config_hash(config) for config in dict.fromkeys(cases)}
+    return hashlib.sha256(" ".join(hashes[c] for c in cases).encode()).hexdigest()[:16]
+
+
+def _run_chunks(
+    sweep: SweepConfig,
+    store: Store,
+    chunks: list[Chunk],
+    todo: list[int],
+    missing: int,
+    threads: int | None,
+) -> None:
+    engines: dict[BatchSpec, Engine] = {}
+    steps = [_robot_steps(chunk.configs) for chunk in chunks]
+    total = sum(steps[number] for number in todo)
+    there = len(chunks) - missing
+    if there:
+        print(f"{there} of {len(chunks)} chunks are there already", flush=True)
+    with tqdm(
+        total=total, desc="walking", unit="step", unit_scale=True, disable=None, leave=False,
+        bar_format="{desc} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} robot-steps "
+        "[{elapsed}<{remaining}, {rate_fmt}]{postfix}",
+    ) as bar:  # fmt: skip
+        before = 0
+        for place, number in enumerate(todo):
+            chunk = chunks[number]
+            spec = batch_spec(chunk.configs[0])
+            if spec not in engines:
+                engines[spec] = build_engine(sweep, chunk.configs[0], threads)
+
+            def on_progress(done: int, whole: int, here: int = before, n: int = number) -> None:
+                bar.update(here + round(steps[n] * done / whole) - bar.n)
+
+            bar.set_postfix_str(f"chunk {place + 1} of {len(todo)}")
+            clock = time.perf_counter()
+            recording = engines[spec].run(chunk.configs, on_progress)
+            if recording.interrupted:
+                raise KeyboardInterrupt
+            rows = list(recording.metrics())[: len(chunk.cases)]
+            store.write(number, columns(rows))
+            before += steps[number]
+            if bar.disable:
+                rate = steps[number] / (time.perf_counter() - clock)
+                print(
+                    f"chunk {place + 1} of {len(todo)}: {len(chunk.cases)} robots, "
+                    f"{rate / 1e3:.1f} k robot-steps/s, "
+                    f"{sum(row['fell'] for row in rows)} fell",
+                    flush=True,
+                )
+
+
+def build_engine(sweep: SweepConfig, config: RunConfig, threads: int | None = None) -> Engine:
+    """The engine that a sweep asks for."""
+    dtype = np.dtype(sweep.precision)
+    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise ValueError("precision = 'float64' needs jax_enable_x64")
+    if sweep.engine == "c":
+        from kjax.sim.engines.mujoco_batch import BatchEngine
+
+        return BatchEngine(config, torques=sweep.torques, threads=threads, dtype=dtype)
+    from kjax.sim.engines.mjx import MjxEngine
+
+    return MjxEngine(config, torques=sweep.torques, dtype=dtype)
+
+
+def _robot_steps(configs: Sequence[RunConfig]) -> int:
+    return sum(round(config.duration / config.sim.sim_dt) for config in configs)

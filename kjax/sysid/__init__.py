@@ -1,0 +1,1 @@
+"""Models from recordings of the whole robot."""

@@ -1,0 +1,292 @@
+"""Sweeps with a stand-in for the engine: chunks, resuming, refusals; and a real one, killed."""
+
+import dataclasses
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from kjax.config import ConfigError, SweepConfig, load_config
+from kjax.prediction import storage
+from kjax.runs.sweeps import runner, store
+from kjax.runs.sweeps.runner import chunks_of, run_sweep
+from kjax.runs.sweeps.store import StoreError
+from kjax.types import Mode
+
+SWEEP = """
+base = "walk.toml"
+seeds = 5
+chunk = 4
+[axes.speed]
+values = [0.1, 0.3]
+unit = "m/s"
+[set]
+"sim.contacts" = "feet"
+"duration" = 0.8
+"command.times" = [0.0]
+"command.v_x" = ["= speed"]
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "walk.toml").write_text("")
+    path = tmp_path / "sweep.toml"
+    path.write_text(SWEEP)
+    return path
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Seeds of every chunk that a stand-in engine walked; it stops at the chunk ``stop_at``."""
+    log = SimpleNamespace(chunks=[], stop_at=None)
+
+    class Engine:
+        def run(self, configs, on_progress):
+            if log.stop_at == len(log.chunks):
+                raise KeyboardInterrupt
+            log.chunks.append([config.seed for config in configs])
+            rows = [
+                {"fell": config.seed == 3, "velocity_rmse_mps": config.command.v_x[0]}
+                | ({} if config.seed == 3 else {"pitch_max_deg": float(config.seed)})
+                for config in configs
+            ]
+            return SimpleNamespace(interrupted=False, metrics=lambda: iter(rows))
+
+    monkeypatch.setattr(runner, "build_engine", lambda sweep, config, threads: Engine())
+    return log
+
+
+def walk(file, folder, **more):
+    return run_sweep(load_config(SweepConfig, file), file, folder, **more)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('torques = "held"\n', r"sim\.delay must be a multiple of lmpc\.control_dt 0\.005"),
+        ('engine = "mjx"\n', r"MJX needs sim\.contacts = 'feet'.*got 'all'"),
+    ],
+)
+def test_what_the_engine_cannot_walk_is_refused_before_anything_is_written(
+    file, tmp_path, line, message
+):
+    text = SWEEP.replace('"feet"', '"all"') if "mjx" in line else SWEEP + '"sim.delay" = 0.002\n'
+    file.write_text(line + text)
+    with pytest.raises(ConfigError, match=message):
+        run_sweep(load_config(SweepConfig, file), file, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_dataset_has_every_case_in_its_place(file, tmp_path, calls):
+    data = walk(file, tmp_path / "out")
+    assert data["fell"].dims == ("speed", "seed")
+    np.testing.assert_array_equal(data["fell"].sel(seed=3), [1, 1])
+    assert float(data["fell"].sum()) == 2
+    np.testing.assert_array_equal(data["velocity_rmse_mps"].sel(speed=0.3), 0.3)
+    assert np.isnan(data["pitch_max_deg"].sel(seed=3)).all()
+    assert data["velocity_rmse_mps"].attrs["units"] == "m/s"
+    assert data["speed"].attrs["units"] == "m/s"
+    for key in ("sweep", "base", "provenance"):
+        assert key in data.attrs
+    assert [len(chunk) for chunk in calls.chunks] == [4, 4, 4]  # the last one is filled up
+    with xr.open_dataset(tmp_path / "out" / "sweep.nc") as kept:
+        assert kept.identical(data)
+
+
+def test_an_interrupted_sweep_goes_on_and_a_finished_one_does_nothing(file, tmp_path, calls):
+    whole = walk(file, tmp_path / "whole")
+    calls.chunks.clear()
+    calls.stop_at = 2
+    with pytest.raises(KeyboardInterrupt):
+        walk(file, tmp_path / "out")
+    calls.stop_at = None
+    data = walk(file, tmp_path / "out")
+    assert len(calls.chunks) == 3
+    xr.testing.assert_equal(data, whole)
+    calls.chunks.clear()
+    xr.testing.assert_equal(walk(file, tmp_path / "out"), whole)
+    assert calls.chunks == []
+
+
+def test_another_config_is_refused_with_the_reason(file, tmp_path, calls):
+    walk(file, tmp_path / "out")
+    file.write_text(SWEEP.replace("0.8", "0.9"))
+    with pytest.raises(
+        StoreError, match=r"another config \(sweep\.set\.duration was 0\.8, is 0\.9"
+    ):
+        walk(file, tmp_path / "out")
+    assert walk(file, tmp_path / "out", fresh=True) is not None
+
+
+def test_a_retrained_model_under_the_same_name_is_refused(file, tmp_path, calls):
+    model = tmp_path / "model.npz"
+
+    def train(value):
+        spread = np.full((len(Mode), 6), value)
+        storage.save(model, storage.Stored("residual", 0.005, np.zeros((len(Mode), 6, 17)), spread))
+
+    train(1e-3)
+    keys = (
+        f'"koopman.model" = "residual"\n"koopman.file" = "{model}"\n"koopman.dataset.dt" = 0.005\n'
+    )
+    file.write_text(SWEEP + keys + '"lmpc.model_dt" = 0.005\n')
+    walk(file, tmp_path / "out")
+    calls.chunks.clear()
+    walk(file, tmp_path / "out")
+    assert calls.chunks == []
+    train(2e-3)
+    with pytest.raises(StoreError, match="a file that it names, or how its cases are made, has"):
+        walk(file, tmp_path / "out")
+
+
+def test_other_code_is_refused(file, tmp_path, calls, monkeypatch):
+    walk(file, tmp_path / "out")
+    monkeypatch.setattr(runner, "code_version", lambda: "other")
+    with pytest.raises(StoreError, match="other code"):
+        walk(file, tmp_path / "out")
+
+
+def test_a_damaged_chunk_is_named_and_only_it_is_repeated(file, tmp_path, calls):
+    whole = walk(file, tmp_path / "out")
+    path = tmp_path / "out" / "chunks" / "00001.nc"
+    content = bytearray(path.read_bytes())
+    for at in range(0, len(content), 7):
+        content[at] ^= 0x55
+    path.write_bytes(content)
+    with pytest.raises(StoreError, match=r"00001\.nc: damaged"):
+        walk(file, tmp_path / "out")
+    path.unlink()
+    calls.chunks.clear()
+    xr.testing.assert_equal(walk(file, tmp_path / "out"), whole)
+    assert len(calls.chunks) == 1
+
+
+def test_values_that_changed_are_seen(file, tmp_path, calls):
+    walk(file, tmp_path / "out")
+    path = tmp_path / "out" / "chunks" / "00000.nc"
+    with xr.open_dataset(path) as part:
+        changed = part.load()
+    changed["fell"][0] = 1.0 - changed["fell"][0]
+    changed.to_netcdf(path)
+    with pytest.raises(StoreError, match="its checksum differs"):
+        walk(file, tmp_path / "out")
+
+
+def test_two_runs_on_one_folder_are_refused(file, tmp_path, calls):
+    with store.lock(tmp_path / "out"), pytest.raises(StoreError, match="in use by another run"):
+        walk(file, tmp_path / "out")
+
+
+def test_a_full_disk_keeps_what_was_finished(file, tmp_path, calls, monkeypatch):
+    real = xr.Dataset.to_netcdf
+
+    def full(self, path, **more):
+        if "00001" in str(path):
+            path.write_bytes(b"half")
+            raise OSError(28, "No space left on device")
+        return real(self, path, **more)
+
+    monkeypatch.setattr(xr.Dataset, "to_netcdf", full)
+    with pytest.raises(StoreError, match="No space left on device"):
+        walk(file, tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out" / "chunks").iterdir()] == ["00000.nc"]
+
+
+def test_processes_share_the_chunks(file, tmp_path, calls):
+    whole = walk(file, tmp_path / "whole")
+    calls.chunks.clear()
+    shared = tmp_path / "out"
+    assert walk(file, shared, process=0, processes=1) is not None
+    shutil.rmtree(shared / "chunks")
+    calls.chunks.clear()
+
+    def second(name):
+        if name == "opened" and not calls.chunks:
+            calls.chunks.append("second")
+            assert walk(file, shared, process=1, processes=2) is None
+
+    data = walk(file, shared, process=0, processes=2, barrier=second)
+    xr.testing.assert_equal(data, whole)
+    assert len(calls.chunks) == 4  # three of them, and the word
+
+
+def test_chunks_do_not_mix_what_cannot_walk_together(file):
+    sweep = load_config(SweepConfig, file)
+    cases = runner.plan(sweep, file).cases
+    longer = [dataclasses.replace(case, duration=2.0) for case in cases[:3]]
+    made = chunks_of([*cases, *longer], 4)
+    assert [chunk.cases.tolist() for chunk in made] == [
+        [0, 1, 2, 3], [4, 5, 6, 7], [8, 9], [10, 11, 12]
+    ]  # fmt: skip
+    assert [len(chunk.configs) for chunk in made] == [4, 4, 4, 3]
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_three_times_equals_one_that_was_not(file, tmp_path, repository):
+    """The real engine, in processes that are killed without warning."""
+    script = repository / "experiments" / "sweep.py"
+    file.write_text(SWEEP.replace("seeds = 5", "seeds = 16").replace("chunk = 4", "chunk = 2"))
+
+    def start(folder):
+        return subprocess.Popen(
+            [sys.executable, str(script), str(file), "--threads", "1", "--out", str(folder)],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+
+    whole = start(tmp_path / "whole")
+    text, _ = whole.communicate(timeout=300)
+    assert whole.returncode == 0, text
+    for kill in (3, 6, 9):
+        process = start(tmp_path / "out")
+        chunks = tmp_path / "out" / "chunks"
+        while process.poll() is None and len(list(chunks.glob("*.nc"))) < kill:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    assert 9 <= len(list(chunks.glob("*.nc"))) < 16
+    last = start(tmp_path / "out")
+    text, _ = last.communicate(timeout=300)
+    assert last.returncode == 0, text
+    assert "chunks are there already" in text
+    with (
+        xr.open_dataset(tmp_path / "whole" / "sweep.nc") as one,
+        xr.open_dataset(tmp_path / "out" / "sweep.nc") as other,
+    ):
+        xr.testing.assert_equal(one.drop_attrs(), other.drop_attrs())
+
+
+@pytest.mark.slow
+def test_two_processes_over_jax_distributed_equal_one(file, tmp_path, repository):
+    script = repository / "experiments" / "sweep.py"
+
+    def start(folder, *more):
+        return subprocess.Popen(
+            [sys.executable, str(script), str(file), "--threads", "1", "--out", str(folder), *more],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    alone = [start(tmp_path / "one")]
+    pair = [
+        start(tmp_path / "two", "--coordinator", address, "--processes", "2",
+              "--process", str(number))
+        for number in range(2)
+    ]  # fmt: skip
+    for process in (*alone, *pair):
+        text, _ = process.communicate(timeout=400)
+        assert process.returncode == 0, text
+    with (
+        xr.open_dataset(tmp_path / "one" / "sweep.nc") as one,
+        xr.open_dataset(tmp_path / "two" / "sweep.nc") as two,
+    ):
+        xr.testing.assert_equal(one.drop_attrs(), two.drop_attrs())

@@ -1,0 +1,97 @@
+"""Episodes on the batch engine: chunks are kept, what is kept is not repeated. A stand-in walks."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from kjax.config import RunConfig, load_config
+from kjax.runs import batches, pool
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Seeds that the stand-in engine walked, chunk by chunk; it stops at the chunk ``stop_at``."""
+    log = SimpleNamespace(chunks=[], engines=[], stop_at=None)
+
+    class Engine:
+        def __init__(self, config, *, torques, threads, dtype):
+            log.engines.append((torques, threads, np.dtype(dtype)))
+            self.torques = torques
+
+        def run(self, configs):
+            stopped = log.stop_at == len(log.chunks)
+            log.chunks.append([config.seed for config in configs])
+            rows = [
+                {"fell": False, "seed": c.seed, "held": self.torques == "held"} for c in configs
+            ]
+            return SimpleNamespace(
+                interrupted=stopped, metrics=lambda: iter(rows), trajectory=lambda i: rows[i]
+            )
+
+    monkeypatch.setattr(batches, "BatchEngine", Engine)
+    return log
+
+
+@pytest.fixture
+def store(tmp_path):
+    return pool.Store(tmp_path / "episodes.json", "code")
+
+
+@pytest.fixture(scope="module")
+def configs():
+    config = load_config(RunConfig, None, {"duration": 1.0})
+    return [dataclasses.replace(config, seed=seed) for seed in range(7)]
+
+
+def seeds(rows):
+    return [row["seed"] for row in rows]
+
+
+def test_all_chunks_have_one_number_of_robots_and_results_keep_their_order(store, configs, calls):
+    rows = batches.run_batch(store, configs, torques="held", chunk=3, threads=2)
+    assert seeds(rows) == list(range(7))
+    assert calls.chunks == [[0, 1, 2], [3, 4, 5], [6, 6, 6]]
+    assert calls.engines == [("held", 2, np.dtype("float64"))]
+
+
+def test_ctrl_c_keeps_finished_chunks_and_the_same_call_goes_on(store, configs, calls, tmp_path):
+    calls.stop_at = 1
+    with pytest.raises(KeyboardInterrupt):
+        batches.run_batch(store, configs, torques="held", chunk=3)
+    calls.stop_at = None
+    again = pool.Store(tmp_path / "episodes.json", "code")
+    calls.chunks.clear()
+    assert seeds(batches.run_batch(again, configs, torques="held", chunk=3)) == list(range(7))
+    assert calls.chunks == [[3, 4, 5], [6, 6, 6]]
+    calls.chunks.clear()
+    batches.run_batch(again, configs, torques="held", chunk=3)
+    assert calls.chunks == []
+
+
+def test_torques_held_and_at_every_step_are_other_episodes(store, configs, calls):
+    held = batches.run_batch(store, configs, torques="held")
+    every = batches.run_batch(store, configs, torques="every_step")
+    assert all(row["held"] for row in held)
+    assert not any(row["held"] for row in every)
+    assert not set(store.done) & {pool.config_hash(config) for config in configs}
+
+
+def test_what_is_recorded_is_made_again_where_it_is_missing(store, configs, calls, tmp_path):
+    def record(run, path):
+        path.write_text(str(run["seed"]))
+
+    def call():
+        calls.chunks.clear()
+        batches.run_batch(store, configs, torques="held", record=record, recorded=2)
+        return calls.chunks
+
+    assert call() == [list(range(7))]
+    files = [batches.batch_series_file(store, config, "held") for config in configs]
+    assert [file.exists() for file in files] == [True] * 2 + [False] * 5
+    assert files[1].read_text() == "1"
+    assert call() == []
+    files[1].unlink()
+    assert call() == [[1]]
+    assert files[1].read_text() == "1"

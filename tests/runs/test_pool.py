@@ -1,0 +1,292 @@
+"""Many episodes: what is finished is kept, what is kept is not repeated, what changed is."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kjax.config import FitStudyConfig, PushConfig, RunConfig, fields, load_config
+from kjax.files import FILE_KEYS
+from kjax.prediction import storage
+from kjax.runs import pool
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.episode import metrics
+from kjax.sim.resolve import batch_spec
+from kjax.types import Mode
+
+SHORT = {
+    "sim.base": "planar",
+    "duration": 0.7,
+    "command.times": [0.0, 0.3],
+    "command.v_x": [0.0, 0.2],
+}
+WALL = {"plan_ms_median", "plan_ms_p99", "act_ms_median", "act_ms_p99", "realtime_factor"}
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_config(
+        RunConfig, None, SHORT | {"gait.names": ["trot", "bound"], "gait.times": [0.0, 0.5]}
+    )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def simulation(config):
+    """Built once; the runner finds it where a worker would have left it."""
+    built = MujocoEngine(config)
+    pool._engines.clear()
+    pool._engines[batch_spec(config)] = built
+    return built
+
+
+def seeds(config, count):
+    return [dataclasses.replace(config, seed=seed) for seed in range(count)]
+
+
+def without_times(results):
+    return [{k: v for k, v in result.items() if k not in WALL} for result in results]
+
+
+def test_killed_and_resumed_equals_uninterrupted(config, tmp_path, monkeypatch):
+    chosen = seeds(config, 3)
+    whole = pool.Store(tmp_path / "whole" / "episodes.json", "code")
+    (tmp_path / "whole").mkdir()
+    with pool.open_runner(whole) as run:
+        expected = run(chosen)
+
+    path = tmp_path / "episodes.json"
+    real, started = pool.simulate, []
+
+    def killed(simulation, config, on_tick=None):
+        if len(started) == 2:
+            raise KeyboardInterrupt
+        started.append(config.seed)
+        return real(simulation, config)
+
+    monkeypatch.setattr(pool, "simulate", killed)
+    with pytest.raises(KeyboardInterrupt), pool.open_runner(pool.Store(path, "code")) as go:
+        go(chosen)
+    assert len(json.loads(path.read_text())["episodes"]) == 2
+    started[:] = [None]
+    with pool.open_runner(pool.Store(path, "code")) as go:
+        resumed = go(chosen)
+        assert started == [None, 2]
+        assert go(chosen) == resumed  # finished: nothing runs, or `killed` would have ended it
+    assert without_times(resumed) == without_times(expected)
+
+
+def test_another_config_is_run_and_other_code_begins_afresh(config, tmp_path):
+    path = tmp_path / "episodes.json"
+    store = pool.Store(path, "code")
+    with pool.open_runner(store) as run:
+        run(seeds(config, 1))
+        run([dataclasses.replace(config, push=PushConfig(times=(0.2,), forward=1.0))])
+    assert len(store.done) == 2
+    assert not pool.Store(path, "code").outdated
+    other = pool.Store(path, "other code")
+    assert other.outdated
+    assert other.done == {}
+
+
+def test_results_of_other_code_are_set_aside_and_not_dropped(tmp_path):
+    path = tmp_path / "episodes.json"
+    for label in ("one", "two", "one", "two"):
+        store = pool.Store(path, label)
+        assert store.done == {}
+        assert store.outdated == (path.exists())
+        store.add("key", label)
+        assert pool.Store(path, label).done == {"key": label}
+    kept = sorted(json.loads(file.read_text())["episodes"]["key"] for file in tmp_path.iterdir())
+    assert kept == ["one", "one", "two", "two"]
+
+
+def test_looking_at_results_of_other_code_changes_nothing(tmp_path):
+    path = tmp_path / "episodes.json"
+    pool.Store(path, "one").add("key", 1)
+    before = path.read_text()
+    assert pool.Store(path, "two").outdated
+    assert path.read_text() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", '{"label": "code", "episodes": 3}', "{"])
+def test_a_file_that_holds_no_results_is_a_line_and_exit_code_2(tmp_path, capsys, text):
+    path = tmp_path / "episodes.json"
+    path.write_text(text)
+    with pytest.raises(SystemExit) as caught:
+        pool.Store(path, "code")
+    assert caught.value.code == 2
+    assert str(path) in capsys.readouterr().err
+    assert path.read_text() == text
+
+
+def retrain(path, value):
+    spread = np.full((len(Mode), 6), value)
+    return storage.save(
+        path, storage.Stored("residual", 0.005, np.zeros((len(Mode), 6, 17)), spread)
+    )
+
+
+def with_file(path):
+    return load_config(
+        RunConfig,
+        None,
+        {
+            "koopman.model": "residual",
+            "koopman.file": str(path),
+            "koopman.dataset.dt": 0.005,
+            "lmpc.model_dt": 0.005,
+        },
+    )
+
+
+def test_a_retrained_model_under_the_same_name_is_another_config(tmp_path):
+    config = with_file(tmp_path / "model")  # without .npz, as save and load take it
+    missing = pool.config_hash(config)
+    retrain(tmp_path / "model", 1e-3)
+    first = pool.config_hash(config)
+    assert first == pool.config_hash(config) != missing
+    retrain(tmp_path / "model", 2e-3)
+    assert pool.config_hash(config) != first
+
+
+def test_a_program_is_compiled_anew_from_a_retrained_model(tmp_path, monkeypatch):
+    built = []
+    monkeypatch.setattr(MujocoEngine, "_compiled", lambda self, config: built.append(config))
+    config = with_file(retrain(tmp_path / "model.npz", 1e-3))
+    engine = MujocoEngine(config)
+    for value, count in ((1e-3, 1), (2e-3, 2), (2e-3, 2)):
+        retrain(tmp_path / "model.npz", value)
+        engine.program(config)
+        assert len(built) == count
+
+
+def test_every_config_key_that_names_a_file_is_hashed_by_content():
+    named = [
+        name for cls in (RunConfig, FitStudyConfig) for name, *_ in fields(cls)
+        if name.rsplit(".", 1)[-1] in ("file", "path") or name.endswith(("_file", "_path"))
+    ]  # fmt: skip
+    assert set(named) == set(FILE_KEYS)
+
+
+def test_a_study_s_own_file_is_part_of_the_code(tmp_path):
+    file = tmp_path / "study.py"
+    file.write_text("SETS = 3\n")
+    before = pool.code_version(file)
+    assert before != pool.code_version()
+    file.write_text("SETS = 4\n")
+    assert pool.code_version(file) != before
+
+
+def test_a_call_ends_when_enough_is_known(config, tmp_path):
+    store = pool.Store(tmp_path / "episodes.json", "code")
+    with pool.open_runner(store) as run:
+        results = run(seeds(config, 3), enough=lambda results: len(results) >= 1)
+    assert [result is None for result in results] == [False, True, True]
+
+
+def test_a_call_of_which_enough_is_kept_runs_nothing(config, tmp_path, monkeypatch):
+    store = pool.Store(tmp_path / "episodes.json", "code")
+    chosen = seeds(config, 3)
+    store.add(pool.config_hash(chosen[1]), {"interrupted": False})
+    monkeypatch.setattr(pool, "_episode", lambda *a: pytest.fail("an episode was run"))
+    with pool.open_runner(store) as run:
+        results = run(chosen, enough=lambda results: len(results) >= 1)
+    assert [result is None for result in results] == [True, False, True]
+
+
+def test_what_is_recorded_of_a_run_is_made_again_where_it_is_missing(config, tmp_path):
+    store = pool.Store(tmp_path / "episodes.json", "code")
+    (one,) = seeds(config, 1)
+
+    def record(run, path):
+        np.savez(path, x=run.x)
+
+    with pool.open_runner(store, record=record) as run:
+        run([one])
+        file = pool.series_file(store, one)
+        assert np.load(file)["x"].shape == (700, 6)
+        file.unlink()
+        run([one])
+        assert file.exists()
+
+
+def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config, simulation):
+    """As if it had been built for them; the compiled calls are the same."""
+    other = load_config(
+        RunConfig,
+        None,
+        {
+            "sim.base": "planar",
+            "duration": 0.7,
+            "seed": 4,
+            "command.times": [0.0, 0.1],
+            "command.v_x": [0.1, 0.3],
+            "gait.names": ["trot", "bound"],
+            "gait.times": [0.0, 0.4],
+            "sim.friction": 0.6,
+            "push.times": [0.2],
+            "push.forward": 1.0,
+        },
+    )
+    shared, own = simulate(simulation, other), simulate(MujocoEngine(other))
+    assert shared.time[np.argmax(np.diff(shared.gait) != 0)] == pytest.approx(0.399)
+    # 1e-9: constants that the compiler folds in one of the two round differently
+    np.testing.assert_allclose(shared.qpos, own.qpos, atol=1e-9)
+    np.testing.assert_allclose(shared.velocity_command, own.velocity_command, atol=1e-12)
+    first, second = metrics(shared, other), metrics(own, other)
+    assert first["fell"] == second["fell"]
+
+
+def test_a_config_that_needs_another_engine_is_refused(config, simulation):
+    longer = dataclasses.replace(config, lmpc=dataclasses.replace(config.lmpc, horizon=7))
+    with pytest.raises(ValueError, match=r"controller\.horizon is 7, the engine's 6"):
+        simulate(simulation, longer)
+
+
+PARENT = """
+import multiprocessing, os, signal
+from concurrent.futures import ProcessPoolExecutor
+from kjax.runs import pool
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    shared = context.Value("i", 0), context.RawValue("i", 0)
+    pool = ProcessPoolExecutor(1, context, initializer=pool._begin_worker, initargs=shared)
+    print(pool.submit(os.getpid).result(), flush=True)
+    signal.pause()
+"""
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path, repository):
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT, encoding="utf-8")
+    env = {**os.environ, "PYTHONPATH": str(repository)}
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True, env=env)
+    worker = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 30.0
+    while time.monotonic() < deadline and is_alive(worker):
+        time.sleep(0.05)
+    ended = not is_alive(worker)
+    if not ended:
+        os.kill(worker, signal.SIGKILL)
+    assert ended
+
+
+def is_alive(process):
+    """Whether it runs; one that nobody has waited for yet is no more."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{process}/stat")
+    return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")
