@@ -34,12 +34,13 @@ class ModelSpec:
     """Prediction model of a contact mode.
 
     Attributes:
-      kind: "linear", "srb_hover", "srb", "planted", "exact", "bilinear", "residual" or "learned".
+      kind: its name, see ``kjax.prediction.kind``.
       dt: its own step [s].
       dictionary: of "linear" and "bilinear"; ``None`` for the others.
       features: that a residual is fitted to, by name; empty for the others.
       lifted: number of learned observables; 0 for the others.
       measured_feet: whether contact points are the robot's own rather than nominal ones.
+      tabulated: whether tables made once serve, wherever the robot is.
     """
 
     kind: str = "linear"
@@ -48,6 +49,7 @@ class ModelSpec:
     features: str = ""
     lifted: int = 0
     measured_feet: bool = False
+    tabulated: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

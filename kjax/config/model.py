@@ -64,11 +64,10 @@ class DatasetConfig:
 class KoopmanConfig:
     """EDMD models, one per contact mode."""
 
-    model: Literal[
-        "linear", "srb_hover", "srb", "planted", "exact", "bilinear", "residual", "learned"
-    ] = "linear"
-    """Kind of prediction model, see kjax.prediction.families; the paper's is linear. All but it
-    and srb_hover are linearised at every tick where the robot is [-]."""
+    model: str = "linear"
+    """Kind of prediction model: linear (the paper), srb_hover, srb, planted, exact, bilinear,
+    residual, learned, or "module:NAME" for a kjax.prediction.kind.ModelKind of one's own. All but
+    the first two are linearised at every tick where the robot is [-]."""
     file: str = ""
     """Fitted model (.npz): of whole_body.py for residual, of learn_control.py for learned [-]."""
     dictionary: Literal["paper", "paper_literal", "monomials", "fourier"] = "paper"
@@ -89,11 +88,3 @@ class KoopmanConfig:
     """Contact points of the model: constant per mode (the paper) or the robot's own [-]."""
     dataset: DatasetConfig = DatasetConfig()
     """Training data."""
-
-    @model_validator(mode="after")
-    def _check(self) -> "KoopmanConfig":
-        if self.model in ("residual", "learned") and not self.file:
-            raise ValueError(f"model = '{self.model}' needs a file with its numbers")
-        if self.model not in ("residual", "learned") and self.file:
-            raise ValueError(f"model = '{self.model}' takes no file, got '{self.file}'")
-        return self

@@ -100,7 +100,7 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         tables: Tables, problem: Array, start: Start
     ) -> tuple[Array, LinearModel | None]:
         """Lifted state, and the model where that is not one of the tables."""
-        if spec.model.kind == "linear":
+        if spec.model.tabulated:
             z = lift(None, start)
             if not spec.model.measured_feet:
                 return z, None

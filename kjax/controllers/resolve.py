@@ -32,6 +32,7 @@ from kjax.mpc import multiphase
 from kjax.mpc.lmpc import ModeSettings
 from kjax.prediction.build import build_prediction, model_spec
 from kjax.prediction.evaluation import force_response_error
+from kjax.prediction.kind import get_kind
 from kjax.robots import get_robot
 from kjax.spec import ControllerSpec, CycleSpec
 from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
@@ -127,8 +128,8 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
     names = [gaits[problem.gait].name for problem in problems]
     feet = tuple(_nominal_feet(si, robot, name) for name in names)
     modes = tuple(problem.mode for problem in problems)
-    hover = si.koopman.model == "srb_hover"
-    heights = tuple(gait_setting(si, name, "body_height") if hover else 0.0 for name in names)
+    of_height = get_kind(si.koopman.model).of_height
+    heights = tuple(gait_setting(si, name, "body_height") if of_height else 0.0 for name in names)
     # What a file holds may have changed since.
     fit = _fit.__wrapped__ if si.koopman.file else _fit
     mass, inertia = (float(number) for number in body_numbers(si, robot))
@@ -162,7 +163,7 @@ def _fit(
     if not bool(report.finite.all()):
         raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
     prediction = None
-    if koopman.model != "linear":
+    if get_kind(koopman.model).params is not None:
         prediction = build_prediction(body, koopman, key, modes=modes, heights=heights)
     spread = report.residual_rms if prediction is None else prediction.spread
     return jax.device_get(Fits(model, body.feet, spread, prediction))
@@ -170,7 +171,7 @@ def _fit(
 
 def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
     """Warn of a linear EDMD model that an LMPC over this horizon should not rely on."""
-    if config.koopman.model != "linear":
+    if get_kind(config.koopman.model).params is not None:
         return
     gaits = build_gaits(config)
     walked = reachable_gaits(config.gaits, config.gait.names)

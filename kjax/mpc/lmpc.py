@@ -155,7 +155,7 @@ class LmpcSolution(NamedTuple):
 def start_memory(tables: LmpcTables, spec: ControllerSpec) -> LmpcMemory:
     """Memory before the first tick; with a tableau where the Hessian of a mode stays what it is."""
     warm = None
-    hessian_stays = spec.model.kind == "linear" and not spec.model.measured_feet
+    hessian_stays = spec.model.tabulated and not spec.model.measured_feet
     if hessian_stays and spec.warm_start and spec.solver == "tableau":
         warm = qp.start(jax.tree.map(lambda a: a[0], tables.hessian))
     return LmpcMemory(

@@ -19,6 +19,7 @@ from kjax.controllers.params import ControllerParams, Fits, cast
 from kjax.controllers.resolve import fit_models, gather
 from kjax.controllers.rigid_body import body_numbers
 from kjax.prediction.families import BodyModel
+from kjax.prediction.kind import get_kind
 from kjax.robots import get_robot
 from kjax.types import RobotParams
 
@@ -76,10 +77,10 @@ def build_space(
     for key in keys:
         if key not in kinds:
             raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
-        if key.startswith("srb.") and config.koopman.model not in ("srb", "planted", "exact"):
+        if key.startswith("srb.") and not get_kind(config.koopman.model).is_body:
             raise ValueError(
-                f"keys: '{key}' is a variable of koopman.model 'srb', 'planted' and 'exact' only, "
-                f"whose model it is; got '{config.koopman.model}', which is fitted to data"
+                f"keys: '{key}' is a variable of models that are the rigid body ('srb', 'planted', "
+                f"'exact') only; got '{config.koopman.model}', which is fitted to data"
             )
     mass, inertia = (float(number) for number in body_numbers(config, robot))
     config = replace(config, srb=replace(config.srb, mass=mass, inertia=inertia))

@@ -30,7 +30,7 @@ def closed_loop(scripts, monkeypatch, standing_run):
         return standing_run(config, module.seconds, interrupted=module.cut)
 
     monkeypatch.setattr(module.cli, "configure_jax", lambda **more: None)
-    monkeypatch.setattr(module, "build_simulation", build)
+    monkeypatch.setattr(module, "MujocoEngine", build)
     monkeypatch.setattr(module, "simulate", simulate)
     monkeypatch.setattr(
         "kjax.viz.plots.closed_loop_figure",

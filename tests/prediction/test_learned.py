@@ -147,9 +147,9 @@ def test_a_file_that_is_not_there_or_no_file_at_all(tmp_path):
     with pytest.raises(ValueError, match=r"koopman\.file: cannot read"):
         storage.load(tmp_path / "text.npz", "residual")
     with pytest.raises(ValueError, match="model = 'residual' needs a file"):
-        KoopmanConfig(model="residual")
+        build.model_spec(KoopmanConfig(model="residual"))
     with pytest.raises(ValueError, match="model = 'exact' takes no file"):
-        KoopmanConfig(model="exact", file="a.npz")
+        build.model_spec(KoopmanConfig(model="exact", file="a.npz"))
 
 
 def test_weights_of_unknown_features_are_refused(tmp_path):

@@ -17,6 +17,7 @@ from kjax.sim.scene import build_model
 # Where 0.9 times the default, or the next of a list of words, is no value.
 VALUES = {
     "robot": "toy_robot:ROBOT",
+    "koopman.model": "srb",
     "srb.mass": 11.0,
     "srb.inertia": 0.3,
     "srb.feet_front": [0.2, -0.25],

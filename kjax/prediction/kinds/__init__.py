@@ -1,0 +1,1 @@
+"""The kinds of prediction models that kjax has: each module holds ``KINDS``, records by name."""

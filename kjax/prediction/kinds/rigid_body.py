@@ -1,0 +1,41 @@
+"""The rigid body itself: linearised level and at rest once, or where the robot is at every tick."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from kjax.config import KoopmanConfig
+from kjax.koopman.observables import states_only
+from kjax.prediction import families
+from kjax.prediction.families import BodyModel
+from kjax.prediction.kind import Bodies, ModelKind
+from kjax.types import STATE_DIM
+
+
+def _hover(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
+    def one(body: Any, alpha: Any, height: Any) -> Any:
+        return families.linearised_srb(body, alpha, height, config.dataset.dt)
+
+    heights = jnp.asarray(bodies.heights, float)
+    return jax.vmap(one)(bodies.body, bodies.alpha, heights), _certain(bodies)
+
+
+def _body(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
+    return BodyModel(bodies.body, bodies.alpha), _certain(bodies)
+
+
+def _certain(bodies: Bodies) -> Any:
+    return jnp.zeros((len(bodies.modes), STATE_DIM))
+
+
+KINDS = {
+    "srb_hover": ModelKind(
+        family=lambda spec: families.linear(states_only(), spec.dt, "srb_hover"),
+        params=_hover,
+        of_height=True,
+    ),
+    "srb": ModelKind(lambda spec: families.rigid_body(spec.dt), _body, is_body=True),
+    "planted": ModelKind(lambda spec: families.planted(spec.dt), _body, is_body=True),
+    "exact": ModelKind(lambda spec: families.exact(spec.dt), _body, is_body=True),
+}
