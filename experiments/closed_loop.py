@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import ConfigError, RunConfig
-from kjax.runs.pool import Store, code_version, config_hash
+from kjax.runs.cache import Cache, CacheError
 from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
 from kjax.sim.episode import SETTLE_TIME, Trajectory, metrics
 from kjax.sim.summary import summarise
@@ -73,14 +73,14 @@ def main() -> None:
         require_display()
     cli.configure_jax(one_core=True)
     folder = cli.output_folder(args, "closed_loop")
-    store = None if args.seeds is None else open_seeds(config, folder, restart=args.restart)
+    cache = None if args.seeds is None else open_seeds(folder, restart=args.restart)
     clock = time.perf_counter()
     try:
         simulation = MujocoEngine(config)
     except ConfigError as error:
         cli.fail(str(error))
     print(f"models fitted, controller compiled: {time.perf_counter() - clock:.1f} s", flush=True)
-    if store is None:
+    if cache is None:
         run = _simulate_with_bar(simulation, config, view=args.view)
         result = metrics(run, config)
         if run.interrupted:
@@ -92,7 +92,7 @@ def main() -> None:
                 print(f"no metrics: the first {SETTLE_TIME} s, from standing, are left out")
         cli.save_json(folder / "metrics.json", result)
     else:
-        run, config = run_seeds(simulation, config, args.seeds, store)
+        run, config = run_seeds(simulation, config, args.seeds, cache, folder)
     if run is not None:
         save_run(run, config, folder, args)
     if run is not None and run.interrupted:
@@ -184,46 +184,46 @@ def _simulate_in_viewer(simulation: MujocoEngine, config: RunConfig, on_tick: On
             viewer.close()
 
 
-def open_seeds(config: RunConfig, folder: Path, *, restart: bool = False) -> Store:
-    """The finished seeds of this config; ends the program where the folder holds others."""
-    path = folder / "seeds.json"
-    if restart:
-        path.unlink(missing_ok=True)
-    plain = dataclasses.replace(config, seed=0, terrain=dataclasses.replace(config.terrain, seed=0))
-    store = Store(path, f"{config_hash(plain)}@{code_version()}", section="seeds")
-    if store.outdated:
-        cli.fail(
-            f"{path} holds seeds of another config or other code: give --out another folder, or "
-            "--restart to drop them"
-        )
-    return store
+def open_seeds(folder: Path, *, restart: bool = False) -> Cache:
+    """The finished seeds of a folder."""
+    try:
+        return Cache(folder, fresh=restart)
+    except CacheError as error:
+        cli.fail(str(error))
 
 
 def run_seeds(
-    simulation: MujocoEngine, config: RunConfig, count: int, store: Store
+    simulation: MujocoEngine, config: RunConfig, count: int, cache: Cache, folder: Path
 ) -> tuple[Trajectory | None, RunConfig]:
-    """Run seeds, each saved as it ends; returns the first run of this call and its config.
+    """Run seeds, each kept as it ends; returns the first run of this call and its config.
 
-    Each seed is one of noise and, where there are obstacles, of their field as well.
+    Each seed is one of noise and, where there are obstacles, of their field as well. ``seeds.json``
+    holds those that are finished, of this config and code.
     """
-    done = store.done
+    chosen = {
+        seed: dataclasses.replace(
+            config, seed=seed, terrain=dataclasses.replace(config.terrain, seed=seed)
+        )
+        for seed in range(config.seed, config.seed + count)
+    }
+    keys = {seed: cache.key(this) for seed, this in chosen.items()}
     first, first_config = None, config
-    for seed in range(config.seed, config.seed + count):
-        if str(seed) in done:
-            continue
-        field = dataclasses.replace(config.terrain, seed=seed)
-        this = dataclasses.replace(config, seed=seed, terrain=field)
-        run = _simulate_with_bar(simulation, this, label=f"seed {seed}")
-        if run.interrupted:
-            print(f"interrupted in seed {seed} {_progress(run, this)}; finished seeds are kept, "
-                  "run the same command again to go on")  # fmt: skip
-            return run, this
-        if first is None:
-            first, first_config = run, this
-        result = metrics(run, this)
-        store.add(str(seed), result, **summarise([*done.values(), result]))
-    results = [done[str(s)] for s in range(config.seed, config.seed + count)]
-    print_table(results)
+    for seed, this in chosen.items():
+        if keys[seed] not in cache:
+            run = _simulate_with_bar(simulation, this, label=f"seed {seed}")
+            if run.interrupted:
+                print(f"interrupted in seed {seed} {_progress(run, this)}; finished seeds are "
+                      "kept, run the same command again to go on")  # fmt: skip
+                return run, this
+            if first is None:
+                first, first_config = run, this
+            cache.add({keys[seed]: metrics(run, this)})
+        done = {str(s): cache[key] for s, key in keys.items() if key in cache}
+        cli.save_json(
+            folder / "seeds.json",
+            {"provenance": cli.provenance(), "seeds": done, **summarise(done.values())},
+        )
+    print_table([cache[key] for key in keys.values()])
     return first, first_config
 
 

@@ -12,10 +12,10 @@ failed already. On two cores a bisection takes about 2 minutes, a map of pushes 
 """
 
 import dataclasses
-import json
 import math
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ from paper_results import CONFIGS, cycle
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, load_config
 from kjax.runs.bisection import bisect
-from kjax.runs.pool import Run, Store, code_version, config_hash, open_runner
+from kjax.runs.cache import Cache, CacheError
+from kjax.runs.pool import Run, open_runner, read_runner
 
 SHARE = 0.95  # of the seeds that must pass
 SPEED = 0.2  # largest relative error of the mean speed
@@ -138,19 +139,24 @@ def main() -> None:
     args = _parse()
     folder = cli.output_folder(args, "envelope")
     cli.configure_jax(one_core=args.jobs == 1)
-    code = code_version(Path(__file__))
-    store = Store(folder / "episodes.json", code_version())
-    if store.outdated:
-        print(f"{folder}: the code has changed since; starting afresh, what it holds is set aside")
-    found = _kept(folder / "results.json", code, args)
     try:
-        with open_runner(store, jobs=args.jobs) as run:
+        cache = Cache(folder)
+    except CacheError as error:
+        cli.fail(str(error))
+    found: dict[str, Any] = {}
+    for axis in AXES:  # what is not asked for now stays in the figure, if it is there whole
+        for base in ("planar", "free"):
+            if axis.name not in args.only or base not in args.bases:
+                with suppress(KeyError):
+                    found[f"{axis.name}_{base}"] = _search(axis, base, args, read_runner(cache))
+    try:
+        with open_runner(cache, jobs=args.jobs) as run:
             for axis in AXES:
                 for base in args.bases if axis.name in args.only else ():
                     one = _search(axis, base, args, run)
                     found[f"{axis.name}_{base}"] = one
                     print(f"{axis.quantity}, {one['title']}: {_shown(one)}", flush=True)
-                    _save(folder, found, code, args)
+                    _save(folder, found, args)
     except ConfigError as error:
         cli.fail(str(error))
     except KeyboardInterrupt:
@@ -168,20 +174,6 @@ def _parse() -> Namespace:
         quick="2 seeds of 1.2 s, coarsely: to check the script",
         default_out="envelope",
     )
-
-
-def _kept(path: Path, code: str, args: Namespace) -> dict[str, Any]:
-    """Brackets of an earlier call that still hold, so that ``--only`` adds to the figure."""
-    old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    if (old.get("code"), old.get("quick")) != (code, args.quick):
-        return {}
-    return {
-        f"{axis.name}_{base}": old["axes"][f"{axis.name}_{base}"]
-        for axis in AXES
-        for base in ("planar", "free")
-        if old["axes"].get(f"{axis.name}_{base}", {}).get("config")
-        == config_hash(_config(axis, base, args))
-    }
 
 
 def _config(axis: Axis, base: str, args: Namespace) -> RunConfig:
@@ -221,7 +213,6 @@ def _search(axis: Axis, base: str, args: Namespace, run: Run) -> dict[str, Any]:
         "reached_mps": at_limit[0]["reached_mps"] if axis.wants == "speed" and at_limit else None,
         "resolution": resolution,
         "seeds": seeds,
-        "config": config_hash(config),
         "probed": probed,
     }
 
@@ -324,10 +315,10 @@ def _shown(one: dict[str, Any]) -> str:
     return limit
 
 
-def _save(folder: Path, found: dict[str, Any], code: str, args: Namespace) -> None:
+def _save(folder: Path, found: dict[str, Any], args: Namespace) -> None:
     from kjax.viz.report import envelope_figure
 
-    record = {"provenance": cli.provenance(), "code": code, "quick": args.quick, "share": SHARE}
+    record = {"provenance": cli.provenance(), "quick": args.quick, "share": SHARE}
     cli.save_json(folder / "results.json", record | {"axes": found})
     envelope_figure(found, folder / "figure.png")
 

@@ -30,7 +30,7 @@ from prediction_models import MODELS
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, load_config
 from kjax.runs.batches import batch_key, run_batch
-from kjax.runs.pool import Store, code_version
+from kjax.runs.cache import Cache, CacheError
 from kjax.sim.intervals import median_interval
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -96,18 +96,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parse(argv)
     folder = cli.output_folder(args, "invariance")
     cli.configure_jax()
-    (folder / "episodes").mkdir(exist_ok=True)
-    label = code_version(Path(__file__))
+    try:
+        cache = Cache(folder)
+    except CacheError as error:
+        cli.fail(str(error))
     parts = list(_parts(args))
     try:
         for number, part in enumerate(parts, start=1):
-            store = Store(folder / "episodes" / f"{part.name}.json", label)
             configs = [config for row in part.configs for config in row]
             run_batch(
-                store, configs, torques="every_step", chunk=len(configs), threads=args.threads,
+                cache, configs, torques="every_step", chunk=len(configs), threads=args.threads,
                 dtype=part.dtype, label=part.name,
             )  # fmt: skip
-            one = judged(part, store)
+            one = judged(part, cache)
             print(f"[{number}/{len(parts)}] {_sentence(one)}", flush=True)
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here")
@@ -115,15 +116,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     everything = _namespace(args, models=_known(args), gaits=list(GAITS), checks=list(LIMITS))
     found = []
     for part in _parts(everything):
-        path = folder / "episodes" / f"{part.name}.json"
-        if path.exists():
-            store = Store(path, label)
-            keys = [batch_key(c, "every_step", part.dtype) for row in part.configs for c in row]
-            if all(key in store.done for key in keys):
-                found.append(judged(part, store))
+        cells = [config for row in part.configs for config in row]
+        if all(batch_key(cache, one, "every_step", part.dtype) in cache for one in cells):
+            found.append(judged(part, cache))
     cli.save_json(
         folder / "results.json",
-        {"provenance": cli.provenance(), "code": label, "quick": args.quick, "limits": LIMITS,
+        {"provenance": cli.provenance(), "quick": args.quick, "limits": LIMITS,
          "parts": found},
     )  # fmt: skip
     text = table(found, quick=args.quick)
@@ -234,14 +232,14 @@ def _placed(config: RunConfig, start: float, floor: float, heading: float) -> Ru
     return dataclasses.replace(config, sim=sim)
 
 
-def judged(part: Part, store: Store) -> dict[str, Any]:
+def judged(part: Part, cache: Cache) -> dict[str, Any]:
     """What a finished part shows: RMSE of each cell, largest difference, whether it is met.
 
     ``largest`` is over the cells, of the medians over the seeds; ``largest_of_a_seed`` compares
     each seed with itself at the first cell, which chaos would show in.
     """
     done = [
-        [store.done[batch_key(config, "every_step", part.dtype)] for config in row]
+        [cache[batch_key(cache, config, "every_step", part.dtype)] for config in row]
         for row in part.configs
     ]
     falls = [sum(one["fell"] for one in row) for row in done]

@@ -7,7 +7,6 @@ of other code, or of a model that would walk other episodes now, is refused.
 """
 
 import dataclasses
-import hashlib
 import json
 import time
 from pathlib import Path
@@ -19,7 +18,7 @@ from prediction_models import MODELS, residual
 
 from kjax import cli
 from kjax.config import Gaits, RunConfig, load_config
-from kjax.runs.pool import code_version, config_hash
+from kjax.runs.cache import Cache, CacheError
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
@@ -46,33 +45,25 @@ def main() -> None:
         walks = json.loads(file.read_text(encoding="utf-8"))["walks"]
         return figure(walks, folder / "figure.png")
     cli.configure_jax()
-    path, clock = folder / "walks.json", time.perf_counter()
-    there = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    code = code_version(Path(__file__))
-    if there and there["code"] != code:
-        cli.fail(f"{path} holds walks of other code or versions: give --out another folder")
-    walks = there.get("walks", {})
+    try:
+        cache = Cache(folder, Path(__file__))
+    except CacheError as error:
+        cli.fail(str(error))
+    clock, walks = time.perf_counter(), {}
     studies = {
         f"{gait}, {name}" + (", quick" if args.quick else ""): Study(gait, name, keys, args.quick)
         for gait in args.gaits
         for name, keys in models_of(gait, args).items()
     }
-    identities = {label: identity(study) for label, study in studies.items()}
-    for label, own in identities.items():
-        if label in walks and walks[label].get("identity") != own:
-            cli.fail(f"{path}: '{label}' would walk other episodes now (its keys, the lists or its "
-                     "file have changed): give --out another folder")  # fmt: skip
     for label, study in studies.items():
-        if label in walks:
-            continue
-        try:
-            walked = walk(study)
-        except KeyboardInterrupt:
-            print(f"interrupted; finished models are kept in {folder}/, run again to go on")
-            raise SystemExit(130) from None
-        named = {"gait": study.gait, "model": study.name, "identity": identities[label]}
-        walks[label] = {**named, **walked}
-        cli.save_json(path, {"code": code, "walks": walks})
+        key = identity(cache, study)
+        if key not in cache:
+            try:
+                cache.add({key: walk(study)})
+            except KeyboardInterrupt:
+                print(f"interrupted; finished models are kept in {folder}/, run again to go on")
+                raise SystemExit(130) from None
+        walks[label] = {"gait": study.gait, "model": study.name, **cache[key]}
         tuned = walks[label]["tuned"]
         print(f"{label}: rmse {tuned['rmse_median']:.4f} m/s, {tuned['falls']} of "
               f"{tuned['episodes']} fell, tuned on {walks[label]['sets']} sets "
@@ -126,11 +117,10 @@ def candidates(study: Study) -> list[RunConfig]:
     return [scaled(base, row) for row in weight_scales(study.sizes[0])]
 
 
-def identity(study: Study) -> str:
-    """Hash of all that decides which episodes are walked, the content of model files included."""
+def identity(cache: Cache, study: Study) -> str:
+    """Key of all that decides which episodes are walked, the content of model files included."""
     _, tune, report = study.sizes
-    text = json.dumps([[config_hash(c) for c in candidates(study)], tune, report])
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return cache.key(*candidates(study), tune, report)
 
 
 def walk(study: Study) -> dict[str, Any]:

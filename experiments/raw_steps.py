@@ -29,7 +29,7 @@ from kjax import cli
 from kjax.config import CommandConfig, RunConfig, load_config
 from kjax.robots import get_robot
 from kjax.runs.batches import batch_key, run_batch
-from kjax.runs.pool import Store, code_version
+from kjax.runs.cache import Cache, CacheError
 from kjax.sim.contacts import body_contact
 from kjax.sim.episode import Trajectory
 from kjax.sim.intervals import median_interval, wilson
@@ -89,30 +89,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parse(argv)
     folder = cli.output_folder(args, "raw_steps")
     cli.configure_jax()
-    (folder / "episodes").mkdir(exist_ok=True)
-    label = code_version(Path(__file__))
+    try:
+        cache = Cache(folder, Path(__file__))
+    except CacheError as error:
+        cli.fail(str(error))
     chosen = [
         Case(gait=gait, base=base, forces=forces)
         for forces in args.forces for gait in args.gaits for base in args.bases
     ]  # fmt: skip
     try:
         for number, case in enumerate(chosen, start=1):
-            store = Store(folder / "episodes" / f"{case.name}.json", label)
             for start in STEPS:
                 configs = [c for _, row in steps_of(case, start, args) for c in row]
                 run_batch(
-                    store, configs, torques="every_step", chunk=args.seeds, threads=args.threads,
+                    cache, configs, torques="every_step", chunk=args.seeds, threads=args.threads,
                     measure=after_step, label=f"{case.name} from {start:g} m/s",
                 )  # fmt: skip
-            print(f"[{number}/{len(chosen)}] {_sentence(case, measured(case, args, store))}",
+            print(f"[{number}/{len(chosen)}] {_sentence(case, measured(case, args, cache))}",
                   flush=True)  # fmt: skip
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here")
         return 130
-    found = list(_finished(folder, label, args))
+    found = list(_finished(cache, args))
     cli.save_json(
         folder / "results.json",
-        {"provenance": cli.provenance(), "code": label, "quick": args.quick, "seeds": args.seeds,
+        {"provenance": cli.provenance(), "quick": args.quick, "seeds": args.seeds,
          "pitch_limit_deg": {f"{size:g}": limit for size, limit in PITCH.items()},
          "steps": found},
     )  # fmt: skip
@@ -188,12 +189,13 @@ def _scene(name: str, base: str, contacts: str) -> tuple[Any, Any]:
     return model, find_addresses(robot, model)
 
 
-def measured(case: Case, args: Namespace, store: Store) -> list[dict[str, Any]]:
+def measured(case: Case, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
     """Falls, body contacts and pitch of each step of a finished case."""
     rows = []
     for start in STEPS:
         for value, configs in steps_of(case, start, args):
-            done = [store.done[batch_key(config, "every_step")] for config in configs]
+            keys = [batch_key(cache, c, "every_step", measure=after_step) for c in configs]
+            done = [cache[key] for key in keys]
             pitch = np.array([one["step_pitch_max_deg"] or np.nan for one in done], float)
             worst = int(np.nanargmax(pitch))
             size = round(abs(value - start), 6)
@@ -233,22 +235,18 @@ def _sentence(case: Case, rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def _finished(folder: Path, label: str, args: Namespace) -> Iterator[dict[str, Any]]:
+def _finished(cache: Cache, args: Namespace) -> Iterator[dict[str, Any]]:
     """Rows of all cases that the folder holds whole, of this code and as many seeds."""
     for forces in FORCES:
         for gait in GAITS:
             for base in BASES:
                 case = Case(gait=gait, base=base, forces=forces)
-                path = folder / "episodes" / f"{case.name}.json"
-                if not path.exists():
-                    continue
-                store = Store(path, label)
                 keys = [
-                    batch_key(config, "every_step")
+                    batch_key(cache, config, "every_step", measure=after_step)
                     for start in STEPS for _, row in steps_of(case, start, args) for config in row
                 ]  # fmt: skip
-                if all(key in store.done for key in keys):
-                    yield from measured(case, args, store)
+                if all(key in cache for key in keys):
+                    yield from measured(case, args, cache)
 
 
 def table(found: Sequence[dict[str, Any]], *, quick: bool) -> str:

@@ -7,7 +7,6 @@ torques held over a control tick. Both bases take about an hour on two quiet cor
 experiments/paper_results.py says what is run.
 """
 
-import json
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -16,14 +15,15 @@ from typing import Any
 
 import koopman_fit
 import numpy as np
-import paper_results
 from koopman_fit import fit_study, save_figure
 from paper_results import CONFIGS, EXPERIMENTS, RMSE, Experiment, Row, base_config, cycle, episodes
 
 from kjax import cli
 from kjax.config import ConfigError, FitStudyConfig, load_config
 from kjax.runs.batches import batch_key, run_batch
-from kjax.runs.pool import Run, Store, code_version, config_hash, open_runner
+from kjax.runs.cache import Cache, CacheError
+from kjax.runs.pool import Run, open_runner, read_runner
+from kjax.sim.engines.contract import Torques
 from kjax.sim.intervals import median_interval, paired_difference, wilson
 from kjax.sim.series import Series, load_series, save_series
 from kjax.sim.summary import summarise, tracking_floor
@@ -64,34 +64,26 @@ def main() -> None:
     cli.configure_jax(one_core=args.jobs == 1)
     chosen = [experiment for experiment in EXPERIMENTS if experiment.name in args.only]
     (folder / "figures").mkdir(exist_ok=True)
-    code = code_version(*map(Path, (__file__, paper_results.__file__, koopman_fit.__file__)))
-    before = _read(folder / "results.json")
+    cache = open_cache(folder)
     record: dict[str, Any] = {
-        "provenance": cli.provenance(), "code": code, "quick": args.quick, "experiments": {}
+        "provenance": cli.provenance(), "quick": args.quick, "experiments": {}
     }  # fmt: skip
-    if before and before.get("code") != code:
-        print(f"{folder}: the code has changed since; the table is made again")
-    elif before:  # what is not asked for now stays on the page
-        record["experiments"] = _kept(before, args)
     if FIT in args.only:
         record["experiments"][FIT] = _fit(folder, quick=args.quick)
-    store = Store(folder / "episodes.json", code_version())
-    if store.outdated:
-        print(f"{folder}: the simulated code has changed since; all episodes are run again, those "
-              "that it holds are set aside")  # fmt: skip
     try:
-        with open_runner(store, jobs=args.jobs, record=save_series) as run:
+        with open_runner(cache, jobs=args.jobs, record=save_series) as run:
             for experiment in chosen:
                 there = record["experiments"].setdefault(experiment.name, {})
                 for base in args.bases:
-                    there[base] = _measure(experiment, base, args, store, run)
+                    there[base] = _measure(experiment, base, args, cache, run)
     except ConfigError as error:
         cli.fail(str(error))
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here")
         raise SystemExit(130) from None
+    _add_finished(record["experiments"], folder, args, cache)
     cli.save_json(folder / "results.json", record)
-    _write_page(folder, record, args)
+    _write_page(folder, record, args, cache)
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"results in {folder}/: index.html, table.md, results.json, figures/")
 
@@ -113,40 +105,49 @@ def _parse() -> Namespace:
     return args
 
 
-def _kept(before: dict[str, Any], args: Namespace) -> dict[str, Any]:
-    """Earlier results that still hold, or are about to be asked for again; says what does not."""
-    if before["quick"] != args.quick:
-        return {}
-    kept: dict[str, Any] = {}
+def open_cache(folder: Path, *code: Path) -> Cache:
+    """The finished results of a folder; ends the program where one is damaged."""
+    try:
+        return Cache(folder, *code)
+    except CacheError as error:
+        cli.fail(str(error))
+
+
+def _add_finished(found: dict[str, Any], folder: Path, args: Namespace, cache: Cache) -> None:
+    """Put on the page what is not asked for now but lies finished in the cache, of this code."""
+    left_off = []
     for experiment in EXPERIMENTS:
-        for base, one in before["experiments"].get(experiment.name, {}).items():
-            if one["config"] == config_hash(base_config(experiment, base, quick=args.quick)):
-                kept.setdefault(experiment.name, {})[base] = one
-            else:
-                again = experiment.name in args.only and base in args.bases
-                print(f"{experiment.name} ({base}): its config has changed; "
-                      + ("it is run again" if again else "its results are dropped"))  # fmt: skip
-    fit = before["experiments"].get(FIT, {})
-    if fit.get("config") == config_hash(_fit_config(quick=args.quick)):
-        kept[FIT] = fit
-    return kept
+        for base in ("planar", "free"):
+            if base in found.get(experiment.name, {}):
+                continue
+            try:
+                one = _measure(experiment, base, args, cache, read_runner(cache), run=False)
+                found.setdefault(experiment.name, {})[base] = one
+            except KeyError:
+                left_off.append(f"{experiment.name} ({base})")
+    if FIT not in found:
+        try:
+            found[FIT] = _fit(folder, quick=args.quick, run=False)
+        except KeyError:
+            left_off.append(FIT)
+    if left_off:
+        print(f"not finished with these configs and this code, so not on the page: "
+              f"{', '.join(left_off)}")  # fmt: skip
 
 
-def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-
-
-def _fit(folder: Path, *, quick: bool) -> dict[str, Any]:
-    """The fit study of Fig. 3; its statistics and the hash of what they came from."""
+def _fit(folder: Path, *, quick: bool, run: bool = True) -> dict[str, Any]:
+    """The fit study of Fig. 3; its statistics. ``KeyError`` where it would have to be run first."""
     config = _fit_config(quick=quick)
-    store = Store(folder / "fit.json", code_version(Path(koopman_fit.__file__)), section="fits")
-    key, figure = config_hash(config), folder / "figures" / f"{FIT}.png"
-    if key not in store.done or not figure.exists():
+    cache = open_cache(folder, Path(koopman_fit.__file__))
+    key, figure = cache.key(config), folder / "figures" / f"{FIT}.png"
+    if key not in cache or not figure.exists():
+        if not run:
+            raise KeyError(key)
         print(f"{FIT}: fitting", flush=True)
         result, curves = fit_study(config)
         save_figure(config, curves, figure)
-        store.add(key, result)
-    return {"config": key, **store.done[key]}
+        cache.add({key: result})
+    return dict(cache[key])
 
 
 def _fit_config(*, quick: bool) -> FitStudyConfig:
@@ -155,21 +156,35 @@ def _fit_config(*, quick: bool) -> FitStudyConfig:
 
 
 def _measure(
-    experiment: Experiment, base: str, args: Namespace, store: Store, run: Run
-) -> dict[str, Any]:
-    """Run what is missing of an experiment on a base; its summary and the rows of the table."""
+    experiment: Experiment, base: str, args: Namespace, cache: Cache, runner: Run, *,
+    run: bool = True,
+) -> dict[str, Any]:  # fmt: skip
+    """Run what is missing of an experiment on a base; its summary and the rows of the table.
+
+    Without ``run`` a missing episode is a ``KeyError``.
+    """
     config = base_config(experiment, base, quick=args.quick)
     chosen = episodes(experiment, config, seeds=args.seeds, terrains=args.terrains)
     label, more = f"{experiment.name} ({base})", {}
     if experiment.vary == "terrain":
-        walk = partial(run_batch, store, chosen, threads=args.jobs)
+        kinds: tuple[Torques, ...] = ("every_step", "held")
+        keys = {torques: [batch_key(cache, c, torques) for c in chosen] for torques in kinds}
+        if not run:
+            missing = [key for one in keys.values() for key in one if key not in cache]
+            missing += [key for key in keys["every_step"][:SHOWN]
+                        if not cache.path(key, ".npz").exists()]  # fmt: skip
+            if missing:
+                raise KeyError(missing[0])
+        walk = partial(run_batch, cache, chosen, threads=args.jobs)
         results = walk(torques="every_step", record=save_series, recorded=SHOWN, label=label)
         held = walk(torques="held", label=f"{label}, torques held")
         more["held"] = {"summary": summarise(held), "cost": held_cost(results, held)}
-        shown = [batch_key(one, "every_step") for one in chosen[:SHOWN]]
+        shown = keys["every_step"][:SHOWN]
     else:
-        results = [result for result in run(chosen, label=label) if result is not None]
-        shown = [config_hash(one) for one in chosen]
+        results = [result for result in runner(chosen, label=label) if result is not None]
+        shown = [cache.key(one) for one in chosen]
+        if not run and not all(cache.path(key, ".npz").exists() for key in shown):
+            raise KeyError(experiment.name)
     total = summarise(results)
     floors = {
         name: tracking_floor(config.command, a, end=config.duration)
@@ -177,7 +192,6 @@ def _measure(
     }
     rows = [_row(row, total, floors, results) for row in experiment.rows]
     return {
-        "config": config_hash(config),
         "episodes": shown,
         "summary": total,
         "floor_rmse_mps": floors,
@@ -256,7 +270,7 @@ def _row(
     }  # fmt: skip
 
 
-def _write_page(folder: Path, record: dict[str, Any], args: Namespace) -> None:
+def _write_page(folder: Path, record: dict[str, Any], args: Namespace, cache: Cache) -> None:
     from kjax.viz.report import write_page
 
     rows = _table(record["experiments"])
@@ -267,7 +281,7 @@ def _write_page(folder: Path, record: dict[str, Any], args: Namespace) -> None:
         notes.insert(0, "A quick check of the machinery: these numbers are no result.")
     cli.write_text(folder / "table.md", "\n".join(lines) + "\n\n" + "\n\n".join(notes) + "\n")
     title = "Koopman LMPC for a quadruped: the paper's results, reproduced"
-    figures = _figures(folder, record["experiments"], args)
+    figures = _figures(folder, record["experiments"], args, cache)
     write_page(folder / "index.html", title, HEADER, rows, figures, notes)
 
 
@@ -341,7 +355,9 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def _figures(folder: Path, experiments: dict[str, Any], args: Namespace) -> list[tuple[str, str]]:
+def _figures(
+    folder: Path, experiments: dict[str, Any], args: Namespace, cache: Cache
+) -> list[tuple[str, str]]:
     """Draw what the results hold; (file, caption) of every figure there is."""
     from kjax.viz.report import switch_figure, terrain_figure, tracking_figure
 
@@ -355,7 +371,7 @@ def _figures(folder: Path, experiments: dict[str, Any], args: Namespace) -> list
             if one is None:
                 continue
             config = base_config(experiment, base, quick=args.quick)
-            runs, results = _load(folder, one["episodes"])
+            runs, results = _load(cache, one["episodes"])
             title = f"{experiment.title}, {base}"
             if experiment.figure == "switch":
                 pairs = [
@@ -376,9 +392,8 @@ def _figures(folder: Path, experiments: dict[str, Any], args: Namespace) -> list
     return drawn
 
 
-def _load(folder: Path, keys: list[str]) -> tuple[list[Series], list[dict[str, Any]]]:
-    done = _read(folder / "episodes.json")["episodes"]
-    return [load_series(folder / "series" / f"{key}.npz") for key in keys], [done[k] for k in keys]
+def _load(cache: Cache, keys: list[str]) -> tuple[list[Series], list[dict[str, Any]]]:
+    return [load_series(cache.path(key, ".npz")) for key in keys], [cache[key] for key in keys]
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Walk a whole sweep of closed loops: a grid or a random sample of configs, times seeds.
 
-Leaves sweep.nc (labelled, xarray), summary.json and figure.png of what its [figure] asks for,
-manifest.json and one file per chunk in the output folder. Run again, it goes on where it stopped;
+Leaves sweep.nc (labelled, xarray), summary.json and figure.png of what its [figure] asks for, and
+in cache/ a file per chunk, in the output folder. Run again, it goes on where it stopped;
 finished, it only draws.
 """
 
@@ -25,7 +25,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="episodes per point, instead of the file's")
     parser.add_argument("--chunk", type=int, help="robots at once, instead of the file's")
     parser.add_argument("--threads", type=int, help="of the C engine (default: one per core)")
-    parser.add_argument("--restart", action="store_true", help="drop what the folder holds")
+    parser.add_argument(
+        "--restart", action="store_true", help="drop all results that the folder holds"
+    )
     parser.add_argument("--draw", action="store_true",
                         help="only draw the sweep.nc of a finished sweep")  # fmt: skip
     parser.add_argument("--distributed", action="store_true",
@@ -54,8 +56,8 @@ def main() -> None:
     barrier = start_processes(args)
     process, processes = jax.process_index(), jax.process_count()
 
+    from kjax.runs.cache import CacheError
     from kjax.runs.sweeps.runner import run_sweep
-    from kjax.runs.sweeps.store import StoreError
 
     clock = time.perf_counter()
     try:
@@ -69,7 +71,7 @@ def main() -> None:
             barrier=barrier,
             fresh=args.restart,
         )
-    except (ConfigError, StoreError) as error:
+    except (ConfigError, CacheError) as error:
         cli.fail(str(error))
     except KeyboardInterrupt:
         print(f"stopped; finished chunks are kept in {folder}/, run again to go on")

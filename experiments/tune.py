@@ -11,8 +11,6 @@ there as well: the same command goes on after Ctrl-C or a kill.
 """
 
 import dataclasses
-import json
-import pickle
 import sys
 import time
 from argparse import Namespace
@@ -26,12 +24,12 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig
-from kjax.runs.pool import code_version, config_hash
+from kjax.runs.cache import Cache, CacheError
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
-from kjax.tuning.optimise import build_objective, check_checkpoint, descend
+from kjax.tuning.optimise import build_objective, descend
 from kjax.tuning.space import TUNABLE, Space, Variables, build_space, shown, tuned_config
 
 TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
@@ -59,12 +57,12 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     except ValueError as error:
         cli.fail(f"--{error}" if str(error).startswith("keys") else str(error))
     begin = worsened(space, args.worsen, args.worsen_seed)
-    identity = config_hash(short) + json.dumps([code_version(Path(__file__)), *_settings(args)])
-    checkpoint = folder / "checkpoint.npz"
     try:
-        check_checkpoint(checkpoint, identity)
-    except ValueError as error:
+        cache = Cache(folder, Path(__file__))
+    except CacheError as error:
         cli.fail(str(error))
+    key = cache.key(short, _settings(args))
+    cache.folder.mkdir(exist_ok=True)
     train, held_out = (
         loop.draw_scenarios(short, seed, count, speeds=args.speeds, pieces=args.pieces)
         for seed, count in ((TRAIN_SEED, args.scenarios), (HELD_OUT_SEED, args.held_out))
@@ -84,7 +82,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
             result = descend(
                 objective, space, train, held_out, start=begin, updates=args.updates,
                 rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
-                checkpoint=checkpoint, identity=identity, on_update=show,
+                checkpoint=cache.path(key, ".npz"), identity=key, on_update=show,
             )  # fmt: skip
         except ValueError as error:
             cli.fail(str(error))
@@ -94,8 +92,8 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     sets = {"own": space.start, "start": begin, "gradient": result.best}
     searches: dict[str, dict[str, Any]] = {}
     for name, first in evolutions(args, begin, result.best).items():
-        path = folder / f"{name.replace(', ', '_')}.pickle"
-        searches[name] = evolve(short, space, first, args, result.seconds, path, identity)
+        own = cache.key(key, name, [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(first)])
+        searches[name] = evolve(short, space, first, args, result.seconds, cache, own)
         sets[name] = searches[name]["best"]
         print(f"{name}: {searches[name]['generations']} generations of "
               f"{searches[name]['population']} in MuJoCo in {searches[name]['seconds']:.0f} s",
@@ -202,7 +200,7 @@ def _own_keys(config: RunConfig) -> tuple[str, ...]:
 def _settings(args: Namespace) -> list[Any]:
     """Options that the descent depends on."""
     names = ("keys", "scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
-             "worsen", "worsen_seed", "memory")  # fmt: skip
+             "worsen", "worsen_seed", "memory", "speeds")  # fmt: skip
     return [getattr(args, name) for name in names]
 
 
@@ -232,9 +230,13 @@ def evolutions(args: Namespace, begin: Variables, tuned: Variables) -> dict[str,
 
 def evolve(
     config: RunConfig, space: Space, begin: Variables, args: Namespace, seconds: float,
-    path: Path, identity: str,
+    cache: Cache, key: str,
 ) -> dict[str, Any]:  # fmt: skip
-    """CMA-ES on batches of MuJoCo walks for some wall time [s]; kept after every generation."""
+    """CMA-ES on batches of MuJoCo walks for some wall time [s]; kept after every generation.
+
+    What is kept is the costs and times of the generations: the search draws the same candidates
+    from the same seed, and is told again what they cost.
+    """
     import cma
 
     leaves, tree = jax.tree.flatten(begin)
@@ -245,21 +247,20 @@ def evolve(
         shaped = [p.reshape(np.shape(a)) for p, a in zip(parts, leaves, strict=True)]
         return space.inside(jax.tree.unflatten(tree, shaped))
 
-    state: dict[str, Any] = {}
-    if path.exists():
-        state = pickle.loads(path.read_bytes())
-        if state["identity"] != identity:
-            cli.fail(f"{path} is of another tuning: take another folder, or remove it")
-    if not state:
-        mean = np.concatenate([np.ravel(leaf) for leaf in leaves])
-        search = cma.CMAEvolutionStrategy(mean, SIGMA, {"seed": 1, "verbose": -9})
-        state = {"identity": identity, "search": search, "seconds": 0.0, "history": [],
-                 "best": np.array(mean), "best_cost": np.inf}  # fmt: skip
-    search = state["search"]
+    mean = np.concatenate([np.ravel(leaf) for leaf in leaves])
+    search = cma.CMAEvolutionStrategy(mean, SIGMA, {"seed": 1, "verbose": -9})
+    costs: list[np.ndarray] = []
+    spent: list[float] = []
+    kept = cache.arrays(key)
+    if kept is not None:
+        for row, seconds_of_it in zip(kept["costs"], kept["seconds"], strict=True):
+            search.tell(search.ask(), row.tolist())
+            costs.append(row)
+            spent.append(float(seconds_of_it))
     walks = mujoco_scenarios(config, args)
     engine = BatchEngine(walks[0], torques="held")
     with tqdm(total=round(seconds), unit="s", desc="CMA-ES", disable=None) as bar:
-        while state["seconds"] < seconds and not search.stop():
+        while sum(spent) < seconds and not search.stop():
             clock = time.perf_counter()
             asked = search.ask()
             candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
@@ -269,25 +270,20 @@ def evolve(
             ])  # fmt: skip
             if recording.interrupted:
                 raise KeyboardInterrupt
-            costs = recording_costs(recording).reshape(len(asked), len(walks)).mean(axis=1)
-            search.tell(asked, costs.tolist())
-            state["history"].append(float(costs.min()))
-            if costs.min() < state["best_cost"]:
-                at = int(np.argmin(costs))
-                state["best"], state["best_cost"] = np.array(asked[at]), float(costs[at])
-            state["seconds"] += time.perf_counter() - clock
-            scratch = path.with_name(path.name + ".part")
-            scratch.write_bytes(pickle.dumps(state))
-            scratch.replace(path)
-            bar.n = min(round(state["seconds"]), bar.total)
-            bar.set_postfix_str(f"cost {state['best_cost']:.3f}")
+            row = recording_costs(recording).reshape(len(asked), len(walks)).mean(axis=1)
+            search.tell(asked, row.tolist())
+            costs.append(row)
+            spent.append(time.perf_counter() - clock)
+            cache.add_arrays(key, {"costs": np.stack(costs), "seconds": np.array(spent)})
+            bar.n = min(round(sum(spent)), bar.total)
+            bar.set_postfix_str(f"cost {min(one.min() for one in costs):.3f}")
     return {
-        "best": unflat(search.result.xfavorite if state["history"] else state["best"]),
-        "generations": len(state["history"]),
+        "best": unflat(search.result.xfavorite if costs else mean),
+        "generations": len(costs),
         "population": search.popsize,
-        "episodes": len(state["history"]) * search.popsize * len(walks),
-        "seconds": state["seconds"],
-        "cost": state["history"],
+        "episodes": len(costs) * search.popsize * len(walks),
+        "seconds": sum(spent),
+        "cost": [float(one.min()) for one in costs],
     }
 
 

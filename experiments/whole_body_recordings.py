@@ -1,6 +1,5 @@
 """The closed-loop episodes of the whole Go1 that whole_body.py learns from, kept in its folder."""
 
-import json
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kjax import cli
-from kjax.config import RunConfig, load_config, to_dict
-from kjax.runs.pool import code_version
+from kjax.config import RunConfig, load_config
+from kjax.runs.cache import Cache, CacheError
 from kjax.sysid.transitions import Episode
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -62,28 +61,16 @@ def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[
 
 
 def kept(kind: str, args: Any, folder: Path) -> dict[str, np.ndarray] | None:
-    """A kind's recording where it lies in the folder; ends the program where another one does."""
-    path = folder / f"episodes_{kind}.npz"
-    if not path.exists():
-        return None
+    """A kind's recording where it lies in the folder; ends the program where it is damaged."""
     try:
-        with np.load(path) as data:
-            arrays = dict(data)
-            held = str(arrays.pop("configs")), str(arrays.pop("code", "none"))
-    except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
-        cli.fail(f"{path}: damaged ({error}); remove it, and only it is recorded again")
-    if held != label(kind_configs(kind, args.robots, args.duration, args.force)):
-        cli.fail(
-            f"{path} holds episodes of another config or other code: give --out another folder, or "
-            "remove it"
-        )
-    return arrays
+        cache = Cache(folder, Path(__file__))
+        return cache.arrays(_key(cache, kind, args))
+    except CacheError as error:
+        cli.fail(str(error))
 
 
-def label(configs: list[RunConfig]) -> tuple[str, str]:
-    """What a recording comes from: configs and code."""
-    wanted = json.dumps([to_dict(config) for config in configs], sort_keys=True)
-    return wanted, code_version(Path(__file__))
+def _key(cache: Cache, kind: str, args: Any) -> str:
+    return cache.key(*kind_configs(kind, args.robots, args.duration, args.force))
 
 
 def record(kind: str, args: Any, folder: Path) -> list[Episode]:
@@ -95,7 +82,7 @@ def record(kind: str, args: Any, folder: Path) -> list[Episode]:
         print(f"{kind}: {args.robots} episodes of {args.duration:g} s are there", flush=True)
         return _episodes(there)
     configs = kind_configs(kind, args.robots, args.duration, args.force)
-    path = folder / f"episodes_{kind}.npz"
+    cache = Cache(folder, Path(__file__))
     print(f"{kind}: recording {args.robots} episodes of {args.duration:g} s ...", flush=True)
     begin = time.perf_counter()
     run = BatchEngine(configs[0], torques="held").run(configs)
@@ -113,10 +100,7 @@ def record(kind: str, args: Any, folder: Path) -> list[Episode]:
         "ticks": run.ticks,
         "fell": run.fell,
     }
-    scratch = path.with_suffix(".part.npz")
-    wanted, code = label(configs)
-    np.savez_compressed(scratch, configs=wanted, code=code, **arrays)
-    scratch.replace(path)
+    cache.add_arrays(_key(cache, kind, args), arrays)
     print(f"  {run.fell.sum()} falls, {time.perf_counter() - begin:.0f} s", flush=True)
     return _episodes(arrays)
 

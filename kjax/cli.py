@@ -322,7 +322,7 @@ def _without_none(data: dict[str, Any]) -> dict[str, Any]:
 
 def save_json(path: Path, data: Any) -> None:
     """Write JSON; NaN and infinity become null, since JSON has neither."""
-    write_text(path, json.dumps(_plain(data), indent=1, allow_nan=False) + "\n")
+    write_text(path, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -332,13 +332,14 @@ def write_text(path: Path, text: str) -> None:
     scratch.replace(path)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Plain data for JSON: lists for arrays and tuples, null for NaN and infinity."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not (-1e308 < value < 1e308):
         return None
     return value

@@ -1,18 +1,18 @@
 """Many episodes on the batch engine, each chunk of robots kept as soon as it ends.
 
-Results lie in an ``episodes.Store`` beside those of single runs, under the hash of the config and
-how torques are computed; so the same command goes on where it stopped.
+Results lie in a ``Cache`` beside those of single runs; so the same command goes on where it
+stopped.
 """
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from kjax.config import RunConfig
-from kjax.runs.pool import Record, Store, config_hash
+from kjax.runs.cache import Cache
+from kjax.runs.pool import Record
 from kjax.sim.engines.contract import Torques
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import Trajectory
@@ -20,19 +20,20 @@ from kjax.sim.episode import Trajectory
 Measure = Callable[[Trajectory, RunConfig], dict[str, Any]]
 
 
-def batch_key(config: RunConfig, torques: Torques, dtype: Any = np.float64) -> str:
-    """Key of an episode's result in the store."""
-    key = f"{config_hash(config)}-{torques}"
-    return key if np.dtype(dtype) == np.float64 else f"{key}-{np.dtype(dtype).name}"
-
-
-def batch_series_file(store: Store, config: RunConfig, torques: Torques) -> Path:
-    """Where ``record`` is to leave what it keeps of an episode."""
-    return store.path.parent / "series" / f"{batch_key(config, torques)}.npz"
+def batch_key(
+    cache: Cache,
+    config: RunConfig,
+    torques: Torques,
+    dtype: Any = np.float64,
+    measure: Measure | None = None,
+) -> str:
+    """Key of an episode's result in the cache."""
+    more = [] if measure is None else [measure.__name__]
+    return cache.key(config, "batch", torques, np.dtype(dtype).name, *more)
 
 
 def run_batch(
-    store: Store,
+    cache: Cache,
     configs: Sequence[RunConfig],
     *,
     torques: Torques,
@@ -44,29 +45,29 @@ def run_batch(
     dtype: Any = np.float64,
     label: str = "",
 ) -> list[dict[str, Any]]:
-    """Metrics of the episodes, in order; what the store holds is not run again.
+    """Metrics of the episodes, in order; what the cache holds is not run again.
 
     Args:
-      store: of results.
+      cache: of results.
       configs: of the robots, with one ``sim.resolve.batch_spec`` and one duration.
       torques: ``"every_step"``, as on the robot, or ``"held"`` over a control tick.
       chunk: robots of one batch, which are kept together.
       threads: of the engine; one per core if ``None``.
       record: called with a run and the path of a file of its own,
       recorded: for the first so many configs.
-      measure: metrics of a run besides the usual ones; the store's label must tell it apart.
+      measure: metrics of a run besides the usual ones; the cache must know its file.
       dtype: floating type of the controller.
       label: of the progress bar.
 
     Raises:
       KeyboardInterrupt: on Ctrl-C; finished chunks are kept.
     """
-    keys = [batch_key(config, torques, dtype) for config in configs]
-    files = [batch_series_file(store, config, torques) for config in configs]
+    keys = [batch_key(cache, config, torques, dtype, measure) for config in configs]
+    files = [cache.path(key, ".npz") for key in keys]
     kept = recorded if record is not None else 0
     missing = [
         number for number, key in enumerate(keys)
-        if key not in store.done or (number < kept and not files[number].exists())
+        if key not in cache or (number < kept and not files[number].exists())
     ]  # fmt: skip
     engine: BatchEngine | None = None
     size = min(chunk, len(missing))
@@ -91,6 +92,6 @@ def run_batch(
             if measure is not None:
                 for robot, number in enumerate(some):
                     rows[robot] |= measure(recording.trajectory(robot), configs[number])
-            store.add_all({keys[n]: row for n, row in zip(some, rows, strict=True)})
+            cache.add({keys[n]: row for n, row in zip(some, rows, strict=True)})
             bar.update(len(some))
-    return [store.done[key] for key in keys]
+    return [cache[key] for key in keys]

@@ -243,16 +243,6 @@ def _save(path: Path, identity: str, run: _Run) -> None:
     scratch.replace(path)
 
 
-def check_checkpoint(path: Path, identity: str) -> None:
-    """See that ``descend`` can go on from a checkpoint, if there is one.
-
-    Raises:
-      ValueError: for one of another tuning, or what is none.
-    """
-    if path.exists():
-        _read(path, identity)
-
-
 def _read(path: Path, identity: str) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -20,13 +20,14 @@ def scripts(repository):
 def closed_loop(scripts, monkeypatch, standing_run):
     """The script; its runs stand still, are ``seconds`` long and interrupted where ``cut``."""
     module = scripts["closed_loop"]
-    module.seconds, module.cut, module.compiled = 2.0, False, 0
+    module.seconds, module.cut, module.compiled, module.walked = 2.0, False, 0, 0
 
     def build(config):
         module.compiled += 1
         return config
 
-    def simulate(config, **more):
+    def simulate(config, *_, **more):
+        module.walked += 1
         return standing_run(config, module.seconds, interrupted=module.cut)
 
     monkeypatch.setattr(module.cli, "configure_jax", lambda **more: None)
@@ -91,23 +92,27 @@ def test_an_interrupted_seed_is_not_kept(closed_loop, monkeypatch, capsys, tmp_p
     assert "2 runs, 0 falls" in capsys.readouterr().out
 
 
-def test_finished_seeds_of_another_config_are_kept_and_the_way_out_is_said(
+def test_seeds_of_another_config_walk_anew_and_finished_ones_stay(
     closed_loop, monkeypatch, capsys, tmp_path
 ):
+    def seeds():
+        return json.loads((tmp_path / "seeds.json").read_text())
+
     words = ("--out", tmp_path, "--seeds", 2, "--duration")
     assert call(closed_loop, monkeypatch, *words, 2.0) == 0
-    before = (tmp_path / "seeds.json").read_text()
-    closed_loop.compiled = 0
-    capsys.readouterr()
-    assert call(closed_loop, monkeypatch, *words, 3.0) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert "another config or other code" in err
-    assert "--restart" in err
-    assert closed_loop.compiled == 0
-    assert (tmp_path / "seeds.json").read_text() == before
-    assert call(closed_loop, monkeypatch, *words, 3.0, "--restart") == 0
-    assert (tmp_path / "seeds.json").read_text() != before
+    before = seeds()
+    assert list(before["seeds"]) == ["0", "1"]
+    closed_loop.walked = 0
+    closed_loop.seconds = 3.0
+    assert call(closed_loop, monkeypatch, *words, 3.0) == 0
+    assert closed_loop.walked == 2
+    assert seeds()["seeds"]["0"]["simulated_s"] == 3.0
+    closed_loop.walked = 0
+    assert call(closed_loop, monkeypatch, *words, 2.0) == 0
+    assert closed_loop.walked == 0  # the first ones are there still
+    assert seeds()["seeds"] == before["seeds"]
+    assert call(closed_loop, monkeypatch, *words, 2.0, "--restart") == 0
+    assert closed_loop.walked == 2
 
 
 def test_a_view_without_a_display_is_refused_before_anything_is_compiled(

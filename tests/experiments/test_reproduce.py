@@ -9,6 +9,7 @@ from argparse import Namespace
 import pytest
 
 from kjax.gait import Gait, phases
+from kjax.runs.cache import Cache
 from kjax.sim.resolve import batch_spec
 
 
@@ -285,24 +286,25 @@ def test_a_quick_reproduction_leaves_page_table_and_json_and_goes_on(
     monkeypatch.setattr(sys, "argv", words)
     experiments.reproduce.main()
     assert {p.name for p in tmp_path.iterdir()} == {
-        "results.json", "table.md", "index.html", "figures", "episodes.json", "series"
+        "results.json", "table.md", "index.html", "figures", "cache"
     }  # fmt: skip
     record = json.loads((tmp_path / "results.json").read_text())
     one = record["experiments"]["trot_rough"]["planar"]
     assert one["summary"]["runs"] == 2
     assert one["rows"][0]["target"] == 0.98
     assert one["held"]["cost"]["crossed"]["fields"] == 2
-    assert len(json.loads((tmp_path / "episodes.json").read_text())["episodes"]) == 4
+    assert len(Cache(tmp_path)) == 4
     page = (tmp_path / "index.html").read_text()
     assert "figures/trot_rough_planar.png" in page
     assert (tmp_path / "figures" / "trot_rough_planar.png").exists()
     assert "rough trot" in (tmp_path / "table.md").read_text()
     assert "rough trot, 0.3 m/s, torques held" in (tmp_path / "table.md").read_text()
 
-    episodes = (tmp_path / "episodes.json").read_text()
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").iterdir()}
     experiments.reproduce.main()
-    assert (tmp_path / "episodes.json").read_text() == episodes  # nothing was run again
-    assert "changed" not in capsys.readouterr().out
+    again = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").iterdir()}
+    assert again == files  # nothing was run again
+    assert "trot_rough (planar)" not in capsys.readouterr().out
 
     (rough,) = (e for e in experiments.paper_results.EXPERIMENTS if e.name == "trot_rough")
     rough.overrides["leg.swing_height"] = 0.2
@@ -311,11 +313,16 @@ def test_a_quick_reproduction_leaves_page_table_and_json_and_goes_on(
         monkeypatch.setattr(experiments.reproduce, "_fit", lambda *a, **k: {
             "largest_scale_within_tolerance": {"trot": {"max": None}}})  # fmt: skip
         experiments.reproduce.main()
+        record = json.loads((tmp_path / "results.json").read_text())
+        assert "trot_rough" not in record["experiments"]
+        (line,) = [one for one in capsys.readouterr().out.splitlines() if "not on the page" in one]
+        assert "trot_rough (planar)" in line
     finally:
         del rough.overrides["leg.swing_height"]
-    assert "trot_rough (planar): its config has changed; its results are dropped" in (
-        capsys.readouterr().out
-    )
+    # With the config as it was, it is on the page again, and runs nothing.
+    experiments.reproduce.main()
+    record = json.loads((tmp_path / "results.json").read_text())
+    assert record["experiments"]["trot_rough"]["planar"]["rows"] == one["rows"]
 
 
 def test_the_floor_of_a_config_is_reported_with_its_rmse(experiments):

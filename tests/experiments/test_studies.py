@@ -25,12 +25,12 @@ def walked(studies, monkeypatch):
     """Stand in for the engine: no walking, one row of metrics for every config; counts them."""
     count = []
 
-    def run(store, configs, *, torques, dtype=np.float64, measure=None, **more):
+    def run(cache, configs, *, torques, dtype=np.float64, measure=None, **more):
         for config in configs:
-            key = batch_key(config, torques, dtype)
-            if key not in store.done:
+            key = batch_key(cache, config, torques, dtype, measure)
+            if key not in cache:
                 count.append(config)
-                store.add(key, row(config))
+                cache.add({key: row(config)})
 
     def row(config):
         out = {"fell": False, "velocity_rmse_mps": 0.02 + walked.error(config), "qp_unsolved": 0}

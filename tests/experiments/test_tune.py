@@ -46,10 +46,13 @@ def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(t
     assert {p.name for p in tmp_path.iterdir()} >= {"tuned.toml", "table.md", "figure.png"}
     tuned = load_config(RunConfig, tmp_path / "tuned.toml")
     assert list(tuned.lmpc.Q) == pytest.approx(record["values"]["gradient"]["lmpc.Q"])
-    # Other options, same folder: refused.
-    other = tune(*SMALL, "--rate", "0.3", "--out", str(tmp_path))
-    assert other.returncode == 2
-    assert "of another tuning" in other.stderr
+    # Again: the descent is found. Other speeds are another tuning, and leave the first one.
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    assert tune(*SMALL, "--out", str(tmp_path)).returncode == 0
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    other = tune(*SMALL, "--command.v_x", "[0.1]", "--out", str(tmp_path))
+    assert other.returncode == 0, other.stderr
+    assert len(list((tmp_path / "cache").iterdir())) == 2
 
 
 @pytest.mark.parametrize(

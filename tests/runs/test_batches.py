@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, load_config
-from kjax.runs import batches, pool
+from kjax.runs import batches
+from kjax.runs.cache import Cache
 
 
 @pytest.fixture
@@ -35,8 +36,8 @@ def calls(monkeypatch):
 
 
 @pytest.fixture
-def store(tmp_path):
-    return pool.Store(tmp_path / "episodes.json", "code")
+def cache(tmp_path):
+    return Cache(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -49,19 +50,19 @@ def seeds(rows):
     return [row["seed"] for row in rows]
 
 
-def test_all_chunks_have_one_number_of_robots_and_results_keep_their_order(store, configs, calls):
-    rows = batches.run_batch(store, configs, torques="held", chunk=3, threads=2)
+def test_all_chunks_have_one_number_of_robots_and_results_keep_their_order(cache, configs, calls):
+    rows = batches.run_batch(cache, configs, torques="held", chunk=3, threads=2)
     assert seeds(rows) == list(range(7))
     assert calls.chunks == [[0, 1, 2], [3, 4, 5], [6, 6, 6]]
     assert calls.engines == [("held", 2, np.dtype("float64"))]
 
 
-def test_ctrl_c_keeps_finished_chunks_and_the_same_call_goes_on(store, configs, calls, tmp_path):
+def test_ctrl_c_keeps_finished_chunks_and_the_same_call_goes_on(cache, configs, calls, tmp_path):
     calls.stop_at = 1
     with pytest.raises(KeyboardInterrupt):
-        batches.run_batch(store, configs, torques="held", chunk=3)
+        batches.run_batch(cache, configs, torques="held", chunk=3)
     calls.stop_at = None
-    again = pool.Store(tmp_path / "episodes.json", "code")
+    again = Cache(tmp_path)
     calls.chunks.clear()
     assert seeds(batches.run_batch(again, configs, torques="held", chunk=3)) == list(range(7))
     assert calls.chunks == [[3, 4, 5], [6, 6, 6]]
@@ -70,25 +71,25 @@ def test_ctrl_c_keeps_finished_chunks_and_the_same_call_goes_on(store, configs, 
     assert calls.chunks == []
 
 
-def test_torques_held_and_at_every_step_are_other_episodes(store, configs, calls):
-    held = batches.run_batch(store, configs, torques="held")
-    every = batches.run_batch(store, configs, torques="every_step")
+def test_torques_held_and_at_every_step_are_other_episodes(cache, configs, calls):
+    held = batches.run_batch(cache, configs, torques="held")
+    every = batches.run_batch(cache, configs, torques="every_step")
     assert all(row["held"] for row in held)
     assert not any(row["held"] for row in every)
-    assert not set(store.done) & {pool.config_hash(config) for config in configs}
+    assert not any(cache.key(config) in cache for config in configs)  # those of single runs
 
 
-def test_what_is_recorded_is_made_again_where_it_is_missing(store, configs, calls, tmp_path):
+def test_what_is_recorded_is_made_again_where_it_is_missing(cache, configs, calls, tmp_path):
     def record(run, path):
         path.write_text(str(run["seed"]))
 
     def call():
         calls.chunks.clear()
-        batches.run_batch(store, configs, torques="held", record=record, recorded=2)
+        batches.run_batch(cache, configs, torques="held", record=record, recorded=2)
         return calls.chunks
 
     assert call() == [list(range(7))]
-    files = [batches.batch_series_file(store, config, "held") for config in configs]
+    files = [cache.path(batches.batch_key(cache, config, "held"), ".npz") for config in configs]
     assert [file.exists() for file in files] == [True] * 2 + [False] * 5
     assert files[1].read_text() == "1"
     assert call() == []

@@ -1,7 +1,6 @@
 """Many episodes: what is finished is kept, what is kept is not repeated, what changed is."""
 
 import dataclasses
-import json
 import os
 import signal
 import subprocess
@@ -12,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kjax.config import FitStudyConfig, PushConfig, RunConfig, fields, load_config
-from kjax.files import FILE_KEYS
+from kjax.config import PushConfig, RunConfig, load_config
 from kjax.prediction import storage
 from kjax.runs import pool
+from kjax.runs.cache import Cache
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.episode import metrics
 from kjax.sim.resolve import batch_spec
@@ -56,12 +55,9 @@ def without_times(results):
 
 def test_killed_and_resumed_equals_uninterrupted(config, tmp_path, monkeypatch):
     chosen = seeds(config, 3)
-    whole = pool.Store(tmp_path / "whole" / "episodes.json", "code")
-    (tmp_path / "whole").mkdir()
-    with pool.open_runner(whole) as run:
+    with pool.open_runner(Cache(tmp_path / "whole")) as run:
         expected = run(chosen)
 
-    path = tmp_path / "episodes.json"
     real, started = pool.simulate, []
 
     def killed(simulation, config, on_tick=None):
@@ -71,60 +67,29 @@ def test_killed_and_resumed_equals_uninterrupted(config, tmp_path, monkeypatch):
         return real(simulation, config)
 
     monkeypatch.setattr(pool, "simulate", killed)
-    with pytest.raises(KeyboardInterrupt), pool.open_runner(pool.Store(path, "code")) as go:
+    with pytest.raises(KeyboardInterrupt), pool.open_runner(Cache(tmp_path)) as go:
         go(chosen)
-    assert len(json.loads(path.read_text())["episodes"]) == 2
+    assert len(Cache(tmp_path)) == 2
     started[:] = [None]
-    with pool.open_runner(pool.Store(path, "code")) as go:
+    with pool.open_runner(Cache(tmp_path)) as go:
         resumed = go(chosen)
         assert started == [None, 2]
         assert go(chosen) == resumed  # finished: nothing runs, or `killed` would have ended it
     assert without_times(resumed) == without_times(expected)
+    assert pool.read_runner(Cache(tmp_path))(chosen) == resumed
 
 
-def test_another_config_is_run_and_other_code_begins_afresh(config, tmp_path):
-    path = tmp_path / "episodes.json"
-    store = pool.Store(path, "code")
-    with pool.open_runner(store) as run:
+def test_a_runner_that_reads_only_says_what_is_missing(config, tmp_path):
+    with pytest.raises(KeyError):
+        pool.read_runner(Cache(tmp_path))(seeds(config, 1))
+
+
+def test_another_config_is_another_episode(config, tmp_path):
+    cache = Cache(tmp_path)
+    with pool.open_runner(cache) as run:
         run(seeds(config, 1))
         run([dataclasses.replace(config, push=PushConfig(times=(0.2,), forward=1.0))])
-    assert len(store.done) == 2
-    assert not pool.Store(path, "code").outdated
-    other = pool.Store(path, "other code")
-    assert other.outdated
-    assert other.done == {}
-
-
-def test_results_of_other_code_are_set_aside_and_not_dropped(tmp_path):
-    path = tmp_path / "episodes.json"
-    for label in ("one", "two", "one", "two"):
-        store = pool.Store(path, label)
-        assert store.done == {}
-        assert store.outdated == (path.exists())
-        store.add("key", label)
-        assert pool.Store(path, label).done == {"key": label}
-    kept = sorted(json.loads(file.read_text())["episodes"]["key"] for file in tmp_path.iterdir())
-    assert kept == ["one", "one", "two", "two"]
-
-
-def test_looking_at_results_of_other_code_changes_nothing(tmp_path):
-    path = tmp_path / "episodes.json"
-    pool.Store(path, "one").add("key", 1)
-    before = path.read_text()
-    assert pool.Store(path, "two").outdated
-    assert path.read_text() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("text", ["", "[1, 2]", '{"label": "code", "episodes": 3}', "{"])
-def test_a_file_that_holds_no_results_is_a_line_and_exit_code_2(tmp_path, capsys, text):
-    path = tmp_path / "episodes.json"
-    path.write_text(text)
-    with pytest.raises(SystemExit) as caught:
-        pool.Store(path, "code")
-    assert caught.value.code == 2
-    assert str(path) in capsys.readouterr().err
-    assert path.read_text() == text
+    assert len(cache) == 2
 
 
 def retrain(path, value):
@@ -147,16 +112,6 @@ def with_file(path):
     )
 
 
-def test_a_retrained_model_under_the_same_name_is_another_config(tmp_path):
-    config = with_file(tmp_path / "model")  # without .npz, as save and load take it
-    missing = pool.config_hash(config)
-    retrain(tmp_path / "model", 1e-3)
-    first = pool.config_hash(config)
-    assert first == pool.config_hash(config) != missing
-    retrain(tmp_path / "model", 2e-3)
-    assert pool.config_hash(config) != first
-
-
 def test_a_program_is_compiled_anew_from_a_retrained_model(tmp_path, monkeypatch):
     built = []
     monkeypatch.setattr(MujocoEngine, "_compiled", lambda self, config: built.append(config))
@@ -168,50 +123,33 @@ def test_a_program_is_compiled_anew_from_a_retrained_model(tmp_path, monkeypatch
         assert len(built) == count
 
 
-def test_every_config_key_that_names_a_file_is_hashed_by_content():
-    named = [
-        name for cls in (RunConfig, FitStudyConfig) for name, *_ in fields(cls)
-        if name.rsplit(".", 1)[-1] in ("file", "path") or name.endswith(("_file", "_path"))
-    ]  # fmt: skip
-    assert set(named) == set(FILE_KEYS)
-
-
-def test_a_study_s_own_file_is_part_of_the_code(tmp_path):
-    file = tmp_path / "study.py"
-    file.write_text("SETS = 3\n")
-    before = pool.code_version(file)
-    assert before != pool.code_version()
-    file.write_text("SETS = 4\n")
-    assert pool.code_version(file) != before
-
-
 def test_a_call_ends_when_enough_is_known(config, tmp_path):
-    store = pool.Store(tmp_path / "episodes.json", "code")
-    with pool.open_runner(store) as run:
+    cache = Cache(tmp_path)
+    with pool.open_runner(cache) as run:
         results = run(seeds(config, 3), enough=lambda results: len(results) >= 1)
     assert [result is None for result in results] == [False, True, True]
 
 
 def test_a_call_of_which_enough_is_kept_runs_nothing(config, tmp_path, monkeypatch):
-    store = pool.Store(tmp_path / "episodes.json", "code")
+    cache = Cache(tmp_path)
     chosen = seeds(config, 3)
-    store.add(pool.config_hash(chosen[1]), {"interrupted": False})
+    cache.add({cache.key(chosen[1]): {"interrupted": False}})
     monkeypatch.setattr(pool, "_episode", lambda *a: pytest.fail("an episode was run"))
-    with pool.open_runner(store) as run:
+    with pool.open_runner(cache) as run:
         results = run(chosen, enough=lambda results: len(results) >= 1)
     assert [result is None for result in results] == [True, False, True]
 
 
 def test_what_is_recorded_of_a_run_is_made_again_where_it_is_missing(config, tmp_path):
-    store = pool.Store(tmp_path / "episodes.json", "code")
+    cache = Cache(tmp_path)
     (one,) = seeds(config, 1)
 
     def record(run, path):
         np.savez(path, x=run.x)
 
-    with pool.open_runner(store, record=record) as run:
+    with pool.open_runner(cache, record=record) as run:
         run([one])
-        file = pool.series_file(store, one)
+        file = pool.series_file(cache, one)
         assert np.load(file)["x"].shape == (700, 6)
         file.unlink()
         run([one])
@@ -255,6 +193,7 @@ PARENT = """
 import multiprocessing, os, signal
 from concurrent.futures import ProcessPoolExecutor
 from kjax.runs import pool
+from kjax.runs.cache import Cache
 
 if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")

@@ -308,7 +308,7 @@ def test_the_experiment_runs_and_records_once(repository, tmp_path, monkeypatch,
         "metrics.json", "table.md", "details.json", "figure.png",
         "residual_trot.npz", "residual_bound.npz",
         "residual_trot_clock_history.npz", "residual_bound_clock_history.npz",
-        "weights_trot.npz", "weights_bound.npz", "episodes_trot.npz", "episodes_bound.npz",
+        "weights_trot.npz", "weights_bound.npz", "cache",
     }  # fmt: skip
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     # Ten short episodes already: the limits of the whole study with some room.

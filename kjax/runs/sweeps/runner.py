@@ -1,6 +1,5 @@
 """Run a sweep: chunk by chunk, on one process or several, and keep each chunk as it ends."""
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,10 +11,11 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
+from kjax import cli
 from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dict
-from kjax.runs.pool import code_version, config_hash
+from kjax.runs.cache import Cache, lock
+from kjax.runs.sweeps.dataset import merged, write
 from kjax.runs.sweeps.grid import plan
-from kjax.runs.sweeps.store import Store, columns, lock, restart
 from kjax.sim.resolve import BatchSpec, batch_spec, check_engine
 
 Engine = Any  # BatchEngine or MjxEngine: run(configs, on_progress) -> Recording
@@ -77,7 +77,7 @@ def run_sweep(
 
     Raises:
       ConfigError: for cases that are none.
-      StoreError: for a folder that cannot be used.
+      CacheError: for a folder or file that cannot be used.
       KeyboardInterrupt: on Ctrl-C; finished chunks are kept.
     """
     cases = plan(sweep, file)
@@ -90,35 +90,42 @@ def run_sweep(
     meet = barrier or (lambda name: None)
     with lock(folder, f"lock.{process}" if processes > 1 else "lock"):
         if fresh and process == 0:
-            restart(folder)
+            Cache(folder, fresh=True)
         meet("restarted")
-        spec = {
-            "sweep": to_dict(sweep),
-            "base": to_dict(load_config(RunConfig, file.parent / sweep.base)),
-            "cases": _hash_of(cases.cases),
-        }
-        if process == 0:
-            Store(folder, spec, code_version(), len(chunks))
+        cache = Cache(folder)
+        keys = _keys(cache, sweep, cases.cases)
         meet("opened")
-        store = Store(folder, spec, code_version(), len(chunks))
-        todo = store.missing()
+        todo = [
+            number for number, chunk in enumerate(chunks)
+            if any(keys[case] not in cache for case in chunk.cases)
+        ]  # fmt: skip
         own = [number for number in todo if number % processes == process]
-        _run_chunks(sweep, store, chunks, own, len(todo), threads)
+        _run_chunks(sweep, cache, keys, chunks, own, len(todo), threads)
         meet("finished")
         if process > 0:
             return None
-        return store.merge(cases, np.concatenate([chunk.cases for chunk in chunks]), spec)
+        cache.refresh()
+        attributes = {
+            "sweep": to_dict(sweep),
+            "base": to_dict(load_config(RunConfig, file.parent / sweep.base)),
+            "provenance": cli.provenance(),
+        }
+        dataset = merged(cases, [cache[key] for key in keys], attributes)
+        write(dataset, folder / "sweep.nc")
+        return dataset
 
 
-def _hash_of(cases: Sequence[RunConfig]) -> str:
-    """Hash of all cases and of the content of the files that they name."""
-    hashes = {config: config_hash(config) for config in dict.fromkeys(cases)}
-    return hashlib.sha256(" ".join(hashes[c] for c in cases).encode()).hexdigest()[:16]
+def _keys(cache: Cache, sweep: SweepConfig, cases: Sequence[RunConfig]) -> list[str]:
+    """Key of each case's result."""
+    how = [sweep.engine, sweep.torques, sweep.precision]
+    keys = {config: cache.key(config, "sweep", how) for config in dict.fromkeys(cases)}
+    return [keys[config] for config in cases]
 
 
 def _run_chunks(
     sweep: SweepConfig,
-    store: Store,
+    cache: Cache,
+    keys: Sequence[str],
     chunks: list[Chunk],
     todo: list[int],
     missing: int,
@@ -151,7 +158,7 @@ def _run_chunks(
             if recording.interrupted:
                 raise KeyboardInterrupt
             rows = list(recording.metrics())[: len(chunk.cases)]
-            store.write(number, columns(rows))
+            cache.add({keys[case]: row for case, row in zip(chunk.cases, rows, strict=True)})
             before += steps[number]
             if bar.disable:
                 rate = steps[number] / (time.perf_counter() - clock)

@@ -15,9 +15,9 @@ import xarray as xr
 
 from kjax.config import ConfigError, SweepConfig, load_config
 from kjax.prediction import storage
-from kjax.runs.sweeps import runner, store
+from kjax.runs.cache import CacheError, lock
+from kjax.runs.sweeps import runner
 from kjax.runs.sweeps.runner import chunks_of, run_sweep
-from kjax.runs.sweeps.store import StoreError
 from kjax.types import Mode
 
 SWEEP = """
@@ -116,17 +116,31 @@ def test_an_interrupted_sweep_goes_on_and_a_finished_one_does_nothing(file, tmp_
     assert calls.chunks == []
 
 
-def test_another_config_is_refused_with_the_reason(file, tmp_path, calls):
-    walk(file, tmp_path / "out")
+def test_another_config_walks_anew_and_what_was_finished_stays(file, tmp_path, calls):
+    first = walk(file, tmp_path / "out")
     file.write_text(SWEEP.replace("0.8", "0.9"))
-    with pytest.raises(
-        StoreError, match=r"another config \(sweep\.set\.duration was 0\.8, is 0\.9"
-    ):
-        walk(file, tmp_path / "out")
-    assert walk(file, tmp_path / "out", fresh=True) is not None
+    calls.chunks.clear()
+    walk(file, tmp_path / "out")
+    assert len(calls.chunks) == 3
+    file.write_text(SWEEP)
+    calls.chunks.clear()
+    xr.testing.assert_equal(walk(file, tmp_path / "out"), first)
+    assert calls.chunks == []
+    walk(file, tmp_path / "out", fresh=True)
+    assert len(calls.chunks) == 3
 
 
-def test_a_retrained_model_under_the_same_name_is_refused(file, tmp_path, calls):
+def test_more_seeds_walk_only_what_is_new(file, tmp_path, calls):
+    walk(file, tmp_path / "out")
+    calls.chunks.clear()
+    file.write_text(SWEEP.replace("seeds = 5", "seeds = 9"))
+    data = walk(file, tmp_path / "out")
+    assert data.sizes["seed"] == 9
+    assert {seed for chunk in calls.chunks for seed in chunk} >= set(range(5, 9))
+    assert len(calls.chunks) < 5
+
+
+def test_a_retrained_model_under_the_same_name_walks_anew(file, tmp_path, calls):
     model = tmp_path / "model.npz"
 
     def train(value):
@@ -143,25 +157,23 @@ def test_a_retrained_model_under_the_same_name_is_refused(file, tmp_path, calls)
     walk(file, tmp_path / "out")
     assert calls.chunks == []
     train(2e-3)
-    with pytest.raises(StoreError, match="a file that it names, or how its cases are made, has"):
-        walk(file, tmp_path / "out")
-
-
-def test_other_code_is_refused(file, tmp_path, calls, monkeypatch):
     walk(file, tmp_path / "out")
-    monkeypatch.setattr(runner, "code_version", lambda: "other")
-    with pytest.raises(StoreError, match="other code"):
-        walk(file, tmp_path / "out")
+    assert len(calls.chunks) == 3
+
+
+def test_other_code_walks_anew(file, tmp_path, calls, monkeypatch):
+    walk(file, tmp_path / "out")
+    monkeypatch.setattr("kjax.runs.cache.code_version", lambda *files: "other")
+    calls.chunks.clear()
+    walk(file, tmp_path / "out")
+    assert len(calls.chunks) == 3
 
 
 def test_a_damaged_chunk_is_named_and_only_it_is_repeated(file, tmp_path, calls):
     whole = walk(file, tmp_path / "out")
-    path = tmp_path / "out" / "chunks" / "00001.nc"
-    content = bytearray(path.read_bytes())
-    for at in range(0, len(content), 7):
-        content[at] ^= 0x55
-    path.write_bytes(content)
-    with pytest.raises(StoreError, match=r"00001\.nc: damaged"):
+    path = sorted((tmp_path / "out" / "cache").iterdir())[1]
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(CacheError, match=rf"{path.name}: damaged"):
         walk(file, tmp_path / "out")
     path.unlink()
     calls.chunks.clear()
@@ -169,35 +181,22 @@ def test_a_damaged_chunk_is_named_and_only_it_is_repeated(file, tmp_path, calls)
     assert len(calls.chunks) == 1
 
 
-def test_values_that_changed_are_seen(file, tmp_path, calls):
-    walk(file, tmp_path / "out")
-    path = tmp_path / "out" / "chunks" / "00000.nc"
-    with xr.open_dataset(path) as part:
-        changed = part.load()
-    changed["fell"][0] = 1.0 - changed["fell"][0]
-    changed.to_netcdf(path)
-    with pytest.raises(StoreError, match="its checksum differs"):
-        walk(file, tmp_path / "out")
-
-
 def test_two_runs_on_one_folder_are_refused(file, tmp_path, calls):
-    with store.lock(tmp_path / "out"), pytest.raises(StoreError, match="in use by another run"):
+    with lock(tmp_path / "out"), pytest.raises(CacheError, match="in use by another run"):
         walk(file, tmp_path / "out")
 
 
-def test_a_full_disk_keeps_what_was_finished(file, tmp_path, calls, monkeypatch):
-    real = xr.Dataset.to_netcdf
-
+def test_a_full_disk_at_the_end_keeps_what_was_finished(file, tmp_path, calls, monkeypatch):
     def full(self, path, **more):
-        if "00001" in str(path):
-            path.write_bytes(b"half")
-            raise OSError(28, "No space left on device")
-        return real(self, path, **more)
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(xr.Dataset, "to_netcdf", full)
-    with pytest.raises(StoreError, match="No space left on device"):
+    with pytest.raises(CacheError, match="No space left on device"):
         walk(file, tmp_path / "out")
-    assert [path.name for path in (tmp_path / "out" / "chunks").iterdir()] == ["00000.nc"]
+    monkeypatch.undo()
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.is_file()] == [".lock"]
+    assert len(list((tmp_path / "out" / "cache").iterdir())) == 3
 
 
 def test_processes_share_the_chunks(file, tmp_path, calls):
@@ -205,7 +204,7 @@ def test_processes_share_the_chunks(file, tmp_path, calls):
     calls.chunks.clear()
     shared = tmp_path / "out"
     assert walk(file, shared, process=0, processes=1) is not None
-    shutil.rmtree(shared / "chunks")
+    shutil.rmtree(shared / "cache")
     calls.chunks.clear()
 
     def second(name):
@@ -246,12 +245,12 @@ def test_a_sweep_killed_three_times_equals_one_that_was_not(file, tmp_path, repo
     assert whole.returncode == 0, text
     for kill in (3, 6, 9):
         process = start(tmp_path / "out")
-        chunks = tmp_path / "out" / "chunks"
-        while process.poll() is None and len(list(chunks.glob("*.nc"))) < kill:
+        chunks = tmp_path / "out" / "cache"
+        while process.poll() is None and len(list(chunks.glob("*.json"))) < kill:
             time.sleep(0.02)
         process.send_signal(signal.SIGKILL)
         process.communicate()
-    assert 9 <= len(list(chunks.glob("*.nc"))) < 16
+    assert 9 <= len(list(chunks.glob("*.json"))) < 16
     last = start(tmp_path / "out")
     text, _ = last.communicate(timeout=300)
     assert last.returncode == 0, text
