@@ -20,7 +20,7 @@ def main() -> None:
     """Parse the command line and run."""
     parser = cli.script_parser(__doc__.splitlines()[0])
     parser.add_argument("config", help="TOML file of a sweep, e.g. configs/sweeps/trot_rough.toml")
-    parser.add_argument("--engine", choices=("c", "mjx"), help="instead of the file's")
+    parser.add_argument("--engine", help="instead of the file's: mujoco_batch, mjx, mujoco")
     parser.add_argument("--torques", choices=("every_step", "held"), help="instead of the file's")
     parser.add_argument("--seeds", type=int, help="episodes per point, instead of the file's")
     parser.add_argument("--chunk", type=int, help="robots at once, instead of the file's")

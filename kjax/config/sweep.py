@@ -72,8 +72,9 @@ class SweepConfig:
     """Episodes per point, each with another seed of noise and of terrain [-]."""
     first_seed: int = 0
     """The first of them [-]."""
-    engine: Literal["c", "mjx"] = "c"
-    """C MuJoCo, the faster on a CPU, or MJX [-]."""
+    engine: str = "mujoco_batch"
+    """Batches on C MuJoCo, the faster on a CPU; mjx; mujoco (one robot at a time); or "module:NAME"
+    for one of one's own [-]."""
     torques: Literal["every_step", "held"] = "held"
     """Torques at every physics step, or held over a control tick, which is cheaper [-]."""
     precision: Literal["float32", "float64"] = "float32"

@@ -11,7 +11,7 @@ from kjax.legs import kinematics
 from kjax.types import Observation, RobotParams
 
 
-def standing(joint_pos: Float[Array, "4 3"] | None = None) -> Observation:
+def standing(joint_pos: Float[Array | np.ndarray, "4 3"] | None = None) -> Observation:
     """What is measured of a robot that stands still and level on all feet.
 
     Args:
@@ -24,7 +24,7 @@ def standing(joint_pos: Float[Array, "4 3"] | None = None) -> Observation:
         base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
         base_vel=jnp.zeros(3),
         base_ang_vel=jnp.zeros(3),
-        joint_pos=joint_pos,
+        joint_pos=jnp.asarray(joint_pos),
         joint_vel=jnp.zeros((4, 3)),
         contact=jnp.ones(4, bool),
     )

@@ -224,27 +224,3 @@ def _filled(values: Any, count: int, rest: Any) -> np.ndarray:
     values = np.asarray(values, float)
     more = np.broadcast_to(np.asarray(rest, float), (count - len(values), *values.shape[1:]))
     return np.concatenate([values, more])
-
-
-def check_engine(config: RunConfig, *, engine: str = "c", torques: str = "every_step") -> None:
-    """Raise a ValueError that says why an engine cannot walk a config, if it cannot.
-
-    Args:
-      config: of a robot.
-      engine: ``"c"`` or ``"mjx"``.
-      torques: ``"every_step"`` or ``"held"``.
-    """
-    held, delay = torques == "held", config.sim.delay
-    name, tick = (
-        ("lmpc.control_dt", config.lmpc.control_dt) if held else ("leg.act_dt", config.leg.act_dt)
-    )
-    if abs(delay / tick - round(delay / tick)) > 1e-6:
-        raise ValueError(
-            f"with torques = '{torques}' sim.delay must be a multiple of {name} {tick} s, got "
-            f"{delay} s"
-        )
-    if engine == "mjx" and (config.sim.contacts != "feet" or config.sim.cone != "pyramidal"):
-        raise ValueError(
-            "MJX needs sim.contacts = 'feet' and sim.cone = 'pyramidal', got "
-            f"'{config.sim.contacts}' and '{config.sim.cone}'"
-        )

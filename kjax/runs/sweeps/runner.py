@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,9 +15,8 @@ from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dic
 from kjax.runs.cache import Cache, lock
 from kjax.runs.sweeps.dataset import merged, write
 from kjax.runs.sweeps.grid import plan
-from kjax.sim.resolve import BatchSpec, batch_spec, check_engine
-
-Engine = Any  # BatchEngine or MjxEngine: run(configs, on_progress) -> Recording
+from kjax.sim.engines.contract import Engine, get_engine
+from kjax.sim.resolve import BatchSpec, batch_spec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,11 +79,12 @@ def run_sweep(
       KeyboardInterrupt: on Ctrl-C; finished chunks are kept.
     """
     cases = plan(sweep, file)
-    for config in cases.cases:
-        try:
-            check_engine(config, engine=sweep.engine, torques=sweep.torques)
-        except ValueError as error:
-            raise ConfigError(f"{file}: {error}") from None
+    try:
+        engine = get_engine(sweep.engine)
+        for config in cases.cases:
+            engine.check(config, sweep.torques)
+    except ValueError as error:
+        raise ConfigError(f"{file}: {error}") from None
     chunks = chunks_of(cases.cases, sweep.chunk)
     meet = barrier or (lambda name: None)
     with lock(folder, f"lock.{process}" if processes > 1 else "lock"):
@@ -175,13 +174,7 @@ def build_engine(sweep: SweepConfig, config: RunConfig, threads: int | None = No
     dtype = np.dtype(sweep.precision)
     if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
         raise ValueError("precision = 'float64' needs jax_enable_x64")
-    if sweep.engine == "c":
-        from kjax.sim.engines.mujoco_batch import BatchEngine
-
-        return BatchEngine(config, torques=sweep.torques, threads=threads, dtype=dtype)
-    from kjax.sim.engines.mjx import MjxEngine
-
-    return MjxEngine(config, torques=sweep.torques, dtype=dtype)
+    return get_engine(sweep.engine)(config, torques=sweep.torques, threads=threads, dtype=dtype)
 
 
 def _robot_steps(configs: Sequence[RunConfig]) -> int:

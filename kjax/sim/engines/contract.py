@@ -1,12 +1,17 @@
 """What every engine takes and returns: configs of one spec, a ``Recording``."""
 
+import difflib
+import importlib
+import pkgutil
 from collections.abc import Callable, Sequence
 from dataclasses import fields
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
+
+import numpy as np
 
 from kjax.config import RunConfig
 from kjax.sim.recording import Recording
-from kjax.sim.resolve import BatchSpec, batch_spec, check_engine
+from kjax.sim.resolve import BatchSpec, batch_spec
 
 Torques = Literal["every_step", "held"]
 # Called from time to time with the robot-ticks (or steps) done and those in all.
@@ -22,9 +27,69 @@ class Engine(Protocol):
 
     spec: BatchSpec
 
+    def __init__(
+        self,
+        config: RunConfig,
+        *,
+        torques: Torques = "every_step",
+        threads: int | None = None,
+        dtype: Any = np.float32,
+    ):
+        """An engine for configs like this one.
+
+        Args:
+          config: one of those to come.
+          torques: computed at every ``leg.act_dt``, or once per control tick and held.
+          threads: at most; as many as cores if ``None``.
+          dtype: floating type of the controller.
+        """
+
     def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
         """Closed loops of all configs, each until its end or its fall."""
         ...
+
+    @staticmethod
+    def check(config: RunConfig, torques: Torques) -> None:
+        """Raise a ValueError that says why the engine cannot walk a config, if it cannot."""
+
+
+def get_engine(name: str) -> type[Engine]:
+    """An engine by its name: of a module beside this one, or ``"module:NAME"`` for one's own.
+
+    Raises:
+      ValueError: for a name that is none.
+    """
+    import kjax.sim.engines as package
+
+    module, _, attribute = name.partition(":")
+    if not attribute:
+        found = {one.name for one in pkgutil.iter_modules(package.__path__)} - {"contract"}
+        if name not in found:
+            near = difflib.get_close_matches(name, found, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise ValueError(
+                f"engine: got '{name}', wanted one of {', '.join(sorted(found))}, or 'module:NAME' "
+                f"for one of your own{hint}"
+            )
+        module, attribute = f"{package.__name__}.{name}", "ENGINE"
+    try:
+        engine: type[Engine] = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"engine: '{name}' cannot be loaded: {error}") from None
+    return engine
+
+
+def check_delay(config: RunConfig, torques: Torques) -> None:
+    """Refuse a delay that ends between two calls of the controller."""
+    held, delay = torques == "held", config.sim.delay
+    name, tick = (
+        ("lmpc.control_dt", config.lmpc.control_dt) if held else ("leg.act_dt", config.leg.act_dt)
+    )
+    if abs(delay / tick - round(delay / tick)) > 1e-6:
+        raise ValueError(
+            f"with torques = '{torques}' sim.delay must be a multiple of {name} {tick} s, got "
+            f"{delay} s"
+        )
 
 
 def ticks_of(config: RunConfig) -> int:
@@ -53,7 +118,7 @@ def require_one_batch(spec: BatchSpec, configs: Sequence[RunConfig], torques: To
                 f"configs[{i}].duration is {config.duration} s, the first one's "
                 f"{configs[0].duration} s; one batch has one duration"
             )
-        check_engine(config, torques=torques)
+        check_delay(config, torques)
 
 
 def _difference(one: BatchSpec, first: BatchSpec) -> str:

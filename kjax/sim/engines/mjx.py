@@ -20,7 +20,7 @@ from kjax.config import RunConfig
 from kjax.controllers.params import Tables
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop, delayed_torque
-from kjax.sim.engines.contract import OnProgress, Torques, require_one_batch, ticks_of
+from kjax.sim.engines.contract import OnProgress, Torques, check_delay, require_one_batch, ticks_of
 from kjax.sim.engines.mujoco_batch import scene_models
 from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
@@ -29,7 +29,6 @@ from kjax.sim.recording import Recording, recording_of_ticks
 from kjax.sim.resolve import (
     EpisodeParams,
     batch_spec,
-    check_engine,
     push_at,
     stack_episodes,
     stack_tables,
@@ -59,7 +58,7 @@ class MjxState(NamedTuple):
 
 def build_model(config: RunConfig) -> mujoco.MjModel:
     """The scene with the options that MJX needs: few solver iterations, feet-only contacts."""
-    check_engine(config, engine="mjx")
+    _check_scene(config)
     spec = build_spec(get_robot(config.robot), config.sim, config.terrain, visual=False)
     spec.option.iterations = 6
     spec.option.ls_iterations = 8
@@ -84,6 +83,7 @@ class MjxEngine:
         config: RunConfig,
         *,
         torques: Torques = "every_step",
+        threads: int | None = None,
         dtype: Any = np.float32,
         impl: str | None = None,
     ):
@@ -92,6 +92,7 @@ class MjxEngine:
         Args:
           config: one of those to come.
           torques: ``"every_step"`` or ``"held"``.
+          threads: of no effect: XLA has its own.
           dtype: floating type of controller and physics; float64 needs ``jax_enable_x64``.
           impl: implementation of MJX, e.g. ``"warp"`` on an NVIDIA GPU; its own choice if ``None``.
         """
@@ -197,6 +198,12 @@ class MjxEngine:
 
         return jax.tree.map(leaf, tree)
 
+    @staticmethod
+    def check(config: RunConfig, torques: Torques) -> None:
+        """Raise a ValueError that says why this engine cannot walk a config, if it cannot."""
+        check_delay(config, torques)
+        _check_scene(config)
+
     def _compiled(
         self, axes: Any, own_axes: dict[str, int], delays: int
     ) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -278,6 +285,17 @@ class MjxEngine:
             return after, MjxTick(data.qpos, data.qvel, torques[0], log)
 
         return jax.lax.scan(tick, state, None, length=_PIECE)
+
+
+ENGINE = MjxEngine
+
+
+def _check_scene(config: RunConfig) -> None:
+    if config.sim.contacts != "feet" or config.sim.cone != "pyramidal":
+        raise ValueError(
+            "MJX needs sim.contacts = 'feet' and sim.cone = 'pyramidal', got "
+            f"'{config.sim.contacts}' and '{config.sim.cone}'"
+        )
 
 
 # What ``scene.apply_scene`` may change, with what follows from it.

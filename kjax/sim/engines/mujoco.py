@@ -20,7 +20,7 @@ from kjax.controllers.resolve import build_command, controller_key, resolve
 from kjax.files import file_hashes
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import LoopState, Noise, Sensed, TickLog, build_closed_loop
-from kjax.sim.engines.contract import OnProgress, require_one_spec, ticks_of
+from kjax.sim.engines.contract import OnProgress, Torques, require_one_spec, ticks_of
 from kjax.sim.episode import Trajectory, initial_state, sagittal
 from kjax.sim.excitation import force_deviation, force_noise
 from kjax.sim.noise import noise_dim, sensor_noise
@@ -104,9 +104,24 @@ class MujocoEngine:
       observe: (qpos, qvel, sensordata) -> observation.
     """
 
-    def __init__(self, config: RunConfig):
-        """Scene and program of a config; compiles."""
-        self.config, self.spec = config, batch_spec(config)
+    def __init__(
+        self,
+        config: RunConfig,
+        *,
+        torques: Torques = "every_step",
+        threads: int | None = None,
+        dtype: Any = None,
+    ):
+        """Scene and program of a config; compiles.
+
+        Args:
+          config: one of those to come.
+          torques: ``"every_step"``, or ``"held"`` for a control tick.
+          threads: of no effect: one robot walks at a time.
+          dtype: floating type of the controller; JAX's default if ``None``.
+        """
+        self.config, self.spec, self.torques = config, batch_spec(config), torques
+        self._dtype = dtype
         self.robot = get_robot(config.robot)
         self.model = build_model(self.robot, config.sim, config.terrain)
         self.addresses = find_addresses(self.robot, self.model)
@@ -137,6 +152,10 @@ class MujocoEngine:
                 break
         return side_by_side(parts)
 
+    @staticmethod
+    def check(config: RunConfig, torques: Torques) -> None:
+        """This engine walks every config."""
+
     @property
     def _per_tick(self) -> int:
         return round(self.spec.controller.control_dt / self.spec.scene.sim_dt)
@@ -153,8 +172,8 @@ class MujocoEngine:
     def _compiled(self, config: RunConfig) -> Program:
         model, robot, scene = self.model, self.robot, self.spec.scene
         spec, params = resolve(config, robot.params)
-        tables = condense(spec, params)
-        loop = build_closed_loop(robot, self.spec, model, held=False)
+        tables = condense(spec, params, dtype=self._dtype)
+        loop = build_closed_loop(robot, self.spec, model, held=self.torques == "held")
         dtype = tables.params.position_slack.dtype
         parts = [model.nq, model.nv, model.nsensordata]
         parts += [noise_dim(scene.base) * scene.noise, 4 * scene.force_noise]
@@ -235,6 +254,7 @@ class MujocoEngine:
 
         per_tick = self._per_tick
         per_act = round(config.leg.act_dt / config.sim.sim_dt)
+        per_act = per_tick if self.torques == "held" else per_act
         ticks = ticks_of(config)
         steps = ticks * per_tick
         noisy = self.spec.scene.noise
@@ -330,6 +350,9 @@ class MujocoEngine:
             wall_time=wall,
             interrupted=interrupted,
         )
+
+
+ENGINE = MujocoEngine
 
 
 def simulate(

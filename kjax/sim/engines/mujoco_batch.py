@@ -26,7 +26,7 @@ from kjax.config import RunConfig
 from kjax.controllers.params import Tables
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop
-from kjax.sim.engines.contract import OnProgress, Torques, require_one_batch, ticks_of
+from kjax.sim.engines.contract import OnProgress, Torques, check_delay, require_one_batch, ticks_of
 from kjax.sim.episode import initial_state
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, empty_log, recording_of_ticks
@@ -151,6 +151,11 @@ class BatchEngine:
             interrupted=interrupted,
         )
 
+    @staticmethod
+    def check(config: RunConfig, torques: Torques) -> None:
+        """Raise a ValueError that says why this engine cannot walk a config, if it cannot."""
+        check_delay(config, torques)
+
     def _compiled(self, axes: Any) -> Calls:
         """Batched and jitted functions for parameters with these axes."""
         leaves, tree = jax.tree.flatten(axes, is_leaf=lambda a: a is None)
@@ -177,6 +182,9 @@ class BatchEngine:
                 then=jax.jit(jax.vmap(then, (axes, 0, 0, None, 0)), donate_argnums=2),
             )
         return self._calls[key]
+
+
+ENGINE = BatchEngine
 
 
 class _Group:

@@ -10,7 +10,9 @@ import pytest
 from kjax.config import RunConfig, SimConfig, load_config
 from kjax.robots import go1
 from kjax.sim.closed_loop import standing
+from kjax.sim.engines.contract import get_engine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import Trajectory, foot_slip, initial_state, metrics
 from kjax.sim.noise import sensor_noise
 from kjax.types import Observation
@@ -282,3 +284,39 @@ def test_the_papers_velocity_profile_is_tracked(name, limit, repository):
     assert not result["fell"]
     assert result["velocity_rmse_mps"] <= limit
     assert result["qp_unsolved"] == 0
+
+
+def test_engines_are_found_by_name():
+    for name, kind in (("mujoco", MujocoEngine), ("mujoco_batch", BatchEngine)):
+        assert get_engine(name) is kind
+    assert get_engine("kjax.sim.engines.mujoco:MujocoEngine") is MujocoEngine
+    with pytest.raises(ValueError, match=r"engine: got 'mujco', wanted one of .*mean 'mujoco'"):
+        get_engine("mujco")
+    with pytest.raises(ValueError, match=r"engine: 'kjax\.types:NONE' cannot be loaded"):
+        get_engine("kjax.types:NONE")
+
+
+def test_the_single_engine_walks_several_configs_and_records_every_step(simulation):
+    short = dataclasses.replace(simulation.config, duration=0.1)
+    configs = [short, dataclasses.replace(short, seed=5, duration=0.05)]
+    progress = []
+    recording = simulation.run(configs, lambda done, total: progress.append((done, total)))
+    assert recording.qpos.shape[:2] == (100, 2)
+    assert recording.samples.tolist() == [100, 50]
+    assert recording.ticks.tolist() == [20, 10]
+    assert progress[-1] == (150, 150)
+    for robot, config in enumerate(configs):
+        alone, own = simulate(simulation, config), recording.trajectory(robot)
+        np.testing.assert_array_equal(own.qpos, alone.qpos)
+        np.testing.assert_array_equal(own.stance, alone.stance)
+        assert own.plan_time.shape == alone.plan_time.shape
+    assert [row["simulated_s"] for row in recording.metrics()] == pytest.approx([0.1, 0.05])
+
+
+def test_torques_may_be_held_on_the_single_engine_too(simulation):
+    config = dataclasses.replace(simulation.config, duration=0.3)
+    single = simulate(MujocoEngine(config, torques="held", dtype=np.float64), config)
+    batch = BatchEngine(config, torques="held", dtype=np.float64, threads=1).run([config])
+    # The same functions, in another order of sums.
+    np.testing.assert_allclose(single.qpos[::5], batch.qpos[:, 0], atol=1e-7)
+    np.testing.assert_array_equal(single.torque[5:10], np.tile(single.torque[5], (5, 1, 1)))
