@@ -32,9 +32,10 @@ import simulation_benchmark
 
 from kjax import cli
 from kjax.config import RunConfig
-from kjax.sim.engines.mujoco import MujocoEngine, requests, simulate
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.episode import initial_state, metrics
 from kjax.sim.noise import noise_dim
+from kjax.sim.program import requests
 
 STUDIES = {
     "qp": qp_benchmark,

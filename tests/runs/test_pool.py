@@ -114,7 +114,7 @@ def with_file(path):
 
 def test_a_program_is_compiled_anew_from_a_retrained_model(tmp_path, monkeypatch):
     built = []
-    monkeypatch.setattr(MujocoEngine, "_compiled", lambda self, config: built.append(config))
+    monkeypatch.setattr("kjax.sim.engines.mujoco.build_program", lambda c, *a, **k: built.append(c))
     config = with_file(retrain(tmp_path / "model.npz", 1e-3))
     engine = MujocoEngine(config)
     for value, count in ((1e-3, 1), (2e-3, 2), (2e-3, 2)):

@@ -8,9 +8,10 @@ import pytest
 
 from kjax.config import RunConfig, load_config
 from kjax.sim import free_base
-from kjax.sim.engines.mujoco import MujocoEngine, requests, simulate
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import initial_state, metrics
+from kjax.sim.program import requests
 
 WALK = {
     "duration": 1.2,

@@ -5,88 +5,31 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array
 
 from kjax.config import RunConfig
-from kjax.controllers.params import Tables, condense, with_params
-from kjax.controllers.resolve import build_command, controller_key, resolve
+from kjax.controllers.resolve import controller_key
 from kjax.files import file_hashes
 from kjax.robots import get_robot
-from kjax.sim.closed_loop import LoopState, Noise, Sensed, TickLog, build_closed_loop
+from kjax.sim.closed_loop import TickLog
 from kjax.sim.engines.contract import OnProgress, Torques, require_one_spec, ticks_of
 from kjax.sim.episode import Trajectory, initial_state, sagittal
 from kjax.sim.excitation import force_deviation, force_noise
 from kjax.sim.noise import noise_dim, sensor_noise
 from kjax.sim.observe import build_observe, find_addresses
+from kjax.sim.program import Program, build_program, requests
 from kjax.sim.recording import Recording, side_by_side
 from kjax.sim.resolve import batch_spec, push_at, resolve_scene
 from kjax.sim.scene import apply_scene, build_model
-from kjax.types import Command
 
 # Called once per control tick with the steps done, the steps in all and the data; return value
 # ignored. For progress bars and viewers.
 OnTick = Callable[[int, int, mujoco.MjData], None]
 
 _KEPT = 4  # programs that an engine keeps
-
-
-class Requests(NamedTuple):
-    """What is asked of the controller in one episode; data, so that no episode recompiles.
-
-    Attributes:
-      gait_times: (K,) when each gait is asked for [s].
-      command: what is asked over time.
-      origin: (3,) where the robot starts, on the floor, world [m].
-    """
-
-    gait_times: Any
-    command: Command
-    origin: Any
-
-
-class _Carried(NamedTuple):
-    """What goes from call to call."""
-
-    loop: LoopState
-    requests: Requests
-
-
-class Program(NamedTuple):
-    """The compiled calls of one controller, on flat vectors.
-
-    Passing pytrees costs 2 us per leaf and call, more than the controller itself. So the calls take
-    one vector of sensor values (qpos, qvel, sensordata, and the noise on sensors and forces), and
-    keep the controller's state and the episode's requests in another.
-
-    Attributes:
-      tables: of the controller; compiled in.
-      init: (sensed, requests) -> state.
-      plan: (state, sensed) -> (state, log).
-      act: (state, sensed) -> (state, torque (12,) in actuator order).
-      unpack_log: log vectors (P, n) -> ``TickLog`` of arrays with a leading axis P.
-    """
-
-    tables: Tables
-    init: Callable[[ArrayLike, Requests], Array]
-    plan: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
-    act: Callable[[ArrayLike, ArrayLike], tuple[Array, Array]]
-    unpack_log: Callable[[np.ndarray], TickLog]
-
-
-def requests(config: RunConfig) -> Requests:
-    """What a config asks of the controller."""
-    return Requests(
-        gait_times=np.asarray(config.gait.times),
-        command=build_command(config.command),
-        origin=resolve_scene(config)[1].origin,
-    )
 
 
 class MujocoEngine:
@@ -166,81 +109,11 @@ class MujocoEngine:
         if key not in self._programs:
             while len(self._programs) >= _KEPT:
                 del self._programs[next(iter(self._programs))]
-            self._programs[key] = self._compiled(config)
+            self._programs[key] = build_program(
+                config, self.robot, self.spec, self.model,
+                held=self.torques == "held", dtype=self._dtype,
+            )  # fmt: skip
         return self._programs[key]
-
-    def _compiled(self, config: RunConfig) -> Program:
-        model, robot, scene = self.model, self.robot, self.spec.scene
-        spec, params = resolve(config, robot.params)
-        tables = condense(spec, params, dtype=self._dtype)
-        loop = build_closed_loop(robot, self.spec, model, held=self.torques == "held")
-        dtype = tables.params.position_slack.dtype
-        parts = [model.nq, model.nv, model.nsensordata]
-        parts += [noise_dim(scene.base) * scene.noise, 4 * scene.force_noise]
-        cuts = np.cumsum(parts[:-1])
-
-        def split(sensed: Array) -> tuple[Noise, Sensed]:
-            qpos, qvel, sensordata, sensors, force = jnp.split(sensed, cuts)
-            return Noise(sensors, force), Sensed(qpos, qvel, sensordata)
-
-        def pack(tree: _Carried | TickLog) -> Array:
-            return jnp.concatenate([jnp.ravel(a).astype(dtype) for a in jax.tree.leaves(tree)])
-
-        def unpack(flat: Array, like: Any) -> Any:
-            leaves, shape = jax.tree.flatten(like)
-            pieces = jnp.split(flat, np.cumsum([leaf.size for leaf in leaves])[:-1])
-            return jax.tree.unflatten(
-                shape,
-                [
-                    piece.reshape(leaf.shape).astype(leaf.dtype)
-                    for piece, leaf in zip(pieces, leaves, strict=True)
-                ],
-            )
-
-        def with_requests(wanted: Requests) -> Tables:
-            return with_params(tables, gait_times=wanted.gait_times, command=wanted.command)
-
-        def begin(sensed: Array, wanted: Requests) -> _Carried:
-            wanted = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), wanted)
-            return _Carried(loop.init(with_requests(wanted), *split(sensed)), wanted)
-
-        def plan_log(carried: _Carried, sensed: Array) -> tuple[_Carried, TickLog]:
-            wanted = carried.requests
-            state, log = loop.plan(
-                with_requests(wanted), wanted.origin, carried.loop, *split(sensed)
-            )
-            return _Carried(state, wanted), log
-
-        def init(sensed: Array, wanted: Requests) -> Array:
-            return pack(begin(sensed, wanted))
-
-        def plan(flat: Array, sensed: Array) -> tuple[Array, Array]:
-            carried, log = plan_log(unpack(flat, state_like), sensed)
-            return pack(carried), pack(log)
-
-        def act(flat: Array, sensed: Array) -> tuple[Array, Array]:
-            carried = unpack(flat, state_like)
-            state, torque = loop.act(with_requests(carried.requests), carried.loop, *split(sensed))
-            return pack(_Carried(state, carried.requests)), torque
-
-        example = jax.ShapeDtypeStruct((sum(parts),), dtype)
-        wanted = requests(config)
-        state_like = jax.eval_shape(begin, example, wanted)
-        _, log_like = jax.eval_shape(plan_log, state_like, example)
-        program = Program(
-            tables=tables,
-            init=jax.jit(init),
-            plan=jax.jit(plan),
-            act=jax.jit(act),
-            unpack_log=lambda flat: jax.device_get(
-                jax.vmap(lambda one: unpack(one, log_like))(flat)
-            ),
-        )
-        # Compile here, so that the loop's first tick is like its others; the results are dropped.
-        sensed = np.zeros(example.shape)
-        state = program.init(sensed, wanted)
-        jax.block_until_ready((program.plan(state, sensed), program.act(state, sensed)))
-        return program
 
     def _episode(self, config: RunConfig, on_tick: OnTick | None) -> Recording:
         """One closed loop; KeyboardInterrupt if nothing of it is there to keep."""
