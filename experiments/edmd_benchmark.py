@@ -298,7 +298,7 @@ def table(result: dict[str, Any]) -> str:
         "",
         f"| stream of {flow['snapshots']:,} snapshots | |",
         "|---|---|",
-        f"| lifted and into the triangle | {flow['snapshots_per_s']:,.0f} per second |",
+        f"| lifted and into the QR factor | {flow['snapshots_per_s']:,.0f} per second |",
         f"| with their drawing | {flow['snapshots_per_s_with_drawing']:,.0f} per second |",
         f"| peak memory, programs included | {flow['peak_MB']:.0f} MB |",
         f"| of it after the first hundredth | {flow['growth_MB']:.0f} MB |",

@@ -108,8 +108,8 @@ def study(args: argparse.Namespace) -> dict[str, Any]:
                 jax.random.fold_in(key, 1), rollouts=profiles, steps=round(HORIZONS[-1] / DT)
             ).inputs
             out["errors"][name][gait] = {
-                label: judge(family, numbers, plant, here, alpha, starts, forces, frozen)
-                for label, (family, numbers, plant, frozen) in models.items()
+                label: judge(family, params, plant, here, alpha, starts, forces, frozen)
+                for label, (family, params, plant, frozen) in models.items()
             }
     return out
 
@@ -132,7 +132,7 @@ def ranges_of(
 def fit_all(
     args: argparse.Namespace, body: srb_planar.SrbParams, alpha: Any, ranges: SampleRanges
 ) -> Fitted:
-    """Every model of a contact mode: family, numbers, plant it is judged on, frozen or not."""
+    """Every model of a contact mode: family, parameters, plant it is judged on, frozen or not."""
     data = sample(
         jax.random.key(args.seed), body, alpha, ranges, rollouts=ROLLOUTS, steps=STEPS, dt=DT
     )
@@ -183,7 +183,7 @@ def fit_all(
 
 def judge(
     family: families.Family,
-    numbers: Any,
+    params: Any,
     plant: srb_planar.Plant,
     body: srb_planar.SrbParams,
     alpha: Any,
@@ -197,7 +197,7 @@ def judge(
     @jax.jit
     def errors(starts: Any, forces: Any) -> Any:
         found = evaluation.model_errors(
-            family, numbers, plant, body, alpha, starts, forces, frozen=frozen
+            family, params, plant, body, alpha, starts, forces, frozen=frozen
         )
         return found[:, :, at]
 

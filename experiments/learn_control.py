@@ -165,7 +165,7 @@ def costs_of(params: Any, run: loop.Loop) -> Any:
 
     def costs(model: Any, scenarios: loop.Scenario) -> jax.Array:
         fits = params.fits
-        fits = fits._replace(prediction=fits.prediction._replace(numbers=stacked(model)))
+        fits = fits._replace(prediction=fits.prediction._replace(params=stacked(model)))
         own = params._replace(fits=fits)
         return jax.vmap(lambda s: loop.cost(get_robot().params, run(own, s)))(scenarios)
 

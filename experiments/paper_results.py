@@ -105,7 +105,7 @@ EXPERIMENTS = (
             Row(metric=PITCH, label="pitch, 95 % [deg]", target=12.0),
             Row(metric=KNEE, label="time with a saturated knee [-]", target=0.01),
             Row(metric="pitch_max_deg", label="largest pitch [deg]"),
-            Row(metric="plan_ms_median", label="plan: outlook, QP [ms]"),
+            Row(metric="plan_ms_median", label="plan: forecast, QP [ms]"),
             *_REPORTED,
         ),
     ),

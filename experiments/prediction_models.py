@@ -5,7 +5,7 @@ from typing import Any
 MEASURED = {"koopman.feet": "measured"}
 MODELS: dict[str, dict[str, Any]] = {
     "linear (the paper)": {"koopman.model": "linear"},
-    "linear, cautious": {"koopman.model": "linear", "lmpc.caution": 1.0},
+    "linear, cautious": {"koopman.model": "linear", "lmpc.uncertainty_discount": 1.0},
     "linear, measured feet": {"koopman.model": "linear", **MEASURED},
     "linear, measured feet, p = 2": {"koopman.model": "linear", "koopman.order": 2, **MEASURED},
     "SRB at hover": {"koopman.model": "srb_hover", **MEASURED},

@@ -186,8 +186,8 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     def walk(data: Any, torque: Any) -> Any:
         def tick(data: Any, row: Any) -> Any:
             def step(data: Any, _: None) -> Any:
-                moved = mjx.step(model, data.replace(ctrl=row))
-                return jax.tree.map(lambda a, b: a.astype(b.dtype), moved, data), None
+                stepped = mjx.step(model, data.replace(ctrl=row))
+                return jax.tree.map(lambda a, b: a.astype(b.dtype), stepped, data), None
 
             return jax.lax.scan(step, data, None, length=per_tick)[0], data.qpos
 

@@ -7,7 +7,7 @@ points. Half of the episodes are fitted on, a fifth chooses between fits, and 30
 
 Leaves metrics.json (ratios), table.md (every model that an LMPC can predict with), details.json,
 figure.png and, for each gait, residual_<gait>.npz and
-residual_<gait>_clock_history.npz (the affine residual and the one that knows the place in the phase
+residual_<gait>_clock_history.npz (the affine residual and the one that knows the gait's phase
 and the last force, for koopman.model = "residual" with koopman.dataset.dt = 0.005) and
 weights_<gait>.npz (all models). The recordings stay there as well and are used again; a folder
 with those of other configs or other code is refused.
@@ -233,7 +233,7 @@ def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str
             fits = fit_models(config, get_robot(config.robot).params)
             family = build_family(model_spec(config.koopman))
             fits = jax.tree.map(lambda a, at=problem: a[at], fits)
-            own = fits.model if fits.prediction is None else fits.prediction.numbers
+            own = fits.model if fits.prediction is None else fits.prediction.params
             force = np.zeros((len(Mode), 4)) if fits.prediction is None else fits.prediction.force
             feet = fits.feet if config.koopman.feet == "fixed" else None
             for name, view in views.items():

@@ -41,13 +41,15 @@ data = jax.jit(lambda k: sample(k, body, alpha, ranges, rollouts=100, steps=100,
 # %% [markdown]
 # ## Five models behind one interface
 #
-# A family is a record of two pure functions, `lift` and `step`; its numbers are data. Your own
+# A family is a record of two pure functions, `lift` and `step`; its parameters are data. Your own
 # dictionary is one line.
 
 # %%
 plain = observables.paper(4)
 with_rotation = observables.paper(4, constant_rotation=True)
-mine = observables.own(lambda x: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), x[5] * jnp.sin(x[2])]))
+mine = observables.custom_dictionary(
+    lambda x: jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), x[5] * jnp.sin(x[2])])
+)
 known = families.BodyModel(body, alpha)
 models = {
     "linear EDMD (the paper)": (families.linear(plain, DT), edmd.fit(plain, data)[0], "body"),
@@ -66,10 +68,10 @@ starts = sample(jax.random.key(2), body, alpha, ranges, rollouts=20, steps=1, dt
 forces = sample(jax.random.key(3), body, alpha, ranges, rollouts=20, steps=STEPS, dt=DT).inputs
 worst = {}
 fig, ax = plt.subplots(figsize=(7, 4), layout="constrained")
-for name, (family, numbers, plant) in models.items():
+for name, (family, params, plant) in models.items():
     errors = jax.jit(
-        lambda s, f, family=family, numbers=numbers, plant=plant: evaluation.model_errors(
-            family, numbers, plant, body, alpha, s, f
+        lambda s, f, family=family, params=params, plant=plant: evaluation.model_errors(
+            family, params, plant, body, alpha, s, f
         )
     )(starts, forces)
     velocity = np.abs(errors[..., 3:5]).max(axis=(0, 1, 3))

@@ -24,8 +24,10 @@ from kjax.tuning import loop, optimise, space  # noqa: E402
 
 config = load_config(RunConfig, "configs/bound_velocity_short.toml", {"duration": 1.2})
 keys = ["gaits.bound.Q", "gaits.bound.R", "gaits.bound.foothold_gain"]
-numbers = space.build_space(config, keys)
-print({key: np.round(value, 3) for key, value in numbers.overrides(numbers.start).items()})
+search_space = space.build_space(config, keys)
+print(
+    {key: np.round(value, 3) for key, value in search_space.overrides(search_space.start).items()}
+)
 
 # %% [markdown]
 # Variables are logarithms of weights, so that a step of 0.1 is ten per cent of each. A scenario is
@@ -33,10 +35,10 @@ print({key: np.round(value, 3) for key, value in numbers.overrides(numbers.start
 
 # %%
 rng = np.random.default_rng(1)
-bad = numbers.inside(
+bad = search_space.inside(
     {
         key: one + np.log(10.0) * rng.choice([-1.0, 1.0], one.shape)
-        for key, one in numbers.start.items()
+        for key, one in search_space.start.items()
     }
 )
 train, held_out = (loop.draw_scenarios(config, seed, 6, speeds=(0.0, 0.8)) for seed in (100, 200))
@@ -53,7 +55,7 @@ train, held_out = (loop.draw_scenarios(config, seed, 6, speeds=(0.0, 0.8)) for s
 # %%
 def slopes_along(direction, memory):
     """Derivative of each scenario's cost along a direction of the variables, forward mode."""
-    objective = optimise.build_objective(config, numbers, memory=memory)
+    objective = optimise.build_objective(config, search_space, memory=memory)
 
     def along(scenario):
         return jax.jvp(lambda z: objective(z, scenario), (bad,), (direction,))[1]
@@ -61,20 +63,20 @@ def slopes_along(direction, memory):
     return jax.jit(jax.vmap(along))(train)
 
 
-damping = jax.tree.map(np.zeros_like, numbers.start)
+damping = jax.tree.map(np.zeros_like, search_space.start)
 damping["gaits.bound.Q"][3:] = 1.0  # the three velocities' weights together
 slopes = slopes_along(damping, float("inf"))
 print("bad weights, true derivatives:", [f"{slope:.0e}" for slope in slopes])
 
 # %%
 MEMORY = 0.1  # s
-objective = optimise.build_objective(config, numbers, memory=MEMORY)
+objective = optimise.build_objective(config, search_space, memory=MEMORY)
 result = optimise.descend(
-    objective, numbers, train, held_out, start=bad, updates=30, rate=0.2, patience=30
+    objective, search_space, train, held_out, start=bad, updates=30, rate=0.2, patience=30
 )
-own = float(jax.jit(jax.vmap(objective, (None, 0)))(numbers.start, held_out).mean())
+own = float(jax.jit(jax.vmap(objective, (None, 0)))(search_space.start, held_out).mean())
 print(f"held-out cost: {result.held_out[0]:.1f} -> {result.best_cost:.1f}; tuned by hand {own:.1f}")
-print(numbers.overrides(result.best))
+print(search_space.overrides(result.best))
 
 # %% [markdown]
 # ## The loss curve, and the two gaits side by side
@@ -83,7 +85,8 @@ print(numbers.overrides(result.best))
 run = jax.jit(loop.build_loop(config))
 scenario = jax.tree.map(lambda a: a[1], held_out)
 before, after = (
-    jax.device_get(run(numbers.params(variables), scenario)) for variables in (bad, result.best)
+    jax.device_get(run(search_space.params(variables), scenario))
+    for variables in (bad, result.best)
 )
 print(
     "cost of this scenario:",

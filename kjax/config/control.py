@@ -106,7 +106,7 @@ class LmpcConfig:
     """Largest correction of velocity and pitch reference by that [m/s, rad]."""
     position_slack: Annotated[Positive, Tunable(low=1e-4)] = 0.10
     """Largest lead or lag of the integrated position reference before the body [m]."""
-    caution: NonNegative = 0.0
+    uncertainty_discount: NonNegative = 0.0
     """How much less a step of the horizon weighs where the model is less certain; 0: none [-]."""
     solver: Literal["tableau", "admm", "projected_gradient"] = "tableau"
     """Method of the QP: the first is exact, the last keeps no rows (friction, torque) [-]."""

@@ -89,6 +89,7 @@ RETIRED = {
         for key in ("ramp_start", "ramp_cycles", "reference", "force_edge")
     },
     "bound.horizon": "has gone: the gait bound_multiphase predicts through flight (gait.names)",
+    "lmpc.caution": "is now lmpc.uncertainty_discount",
     "gait.stance_time": "has gone: set gaits.trot.period and gaits.trot.duty",
     "gait.trot_flight": "has gone: the gait flying_trot has flights (gait.names)",
     "gait.switch_rule": "is now gaits.bound.switch_rule: 'anywhere', 'first_flight', 'cycle_end'",

@@ -1,4 +1,4 @@
-"""From a place in the gait to forces: within the present stance, or over a whole gait cycle.
+"""From the gait's phase to forces: within the present stance, or over a whole gait cycle.
 
 Both take the same task and return the same plan, so that one program may hold both and each gait
 use its own.
@@ -28,7 +28,7 @@ class ForceTask(NamedTuple):
     """What forces are to be planned for.
 
     Attributes:
-      clock: place in the gait.
+      clock: gait, phase and time in it.
       stance: (4,) legs that stand.
       body: the robot in the sagittal plane, origin on the ground below its centre of mass.
       valid: whether that is what the robot does; else only a safe force is wanted.
@@ -84,8 +84,8 @@ def build_planner(spec: ControllerSpec) -> Planner:
     cycle = _build_cycle_planner(spec.cycle, spec.control_dt)
 
     def plan(tables: Tables, task: ForceTask) -> ForcePlan:
-        foresees = tables.params.multiphase.nodes[task.clock.gait].sum() > 0
-        return jax.lax.cond(foresees & task.stance.any(), cycle, stance, tables, task)
+        uses_gait_cycle = tables.params.multiphase.nodes[task.clock.gait].sum() > 0
+        return jax.lax.cond(uses_gait_cycle & task.stance.any(), cycle, stance, tables, task)
 
     return plan
 
@@ -107,10 +107,10 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
             model = jax.tree.map(lambda a: a[problem], tables.lmpc.model)
             return z, model._replace(B=input_map(model, start.feet))
         fits = tables.params.fits
-        numbers, force, _ = jax.tree.map(lambda a: a[problem], fits.prediction)
+        model_params, force, _ = jax.tree.map(lambda a: a[problem], fits.prediction)
         if not spec.model.measured_feet:
             start = start._replace(feet=fits.feet[problem])
-        return lift(numbers, start), operating_point(family, numbers, start, force, steps)
+        return lift(model_params, start), operating_point(family, model_params, start, force, steps)
 
     limited = spec.friction_rows or spec.torque_rows
 
@@ -201,7 +201,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
         settings = multiphase.for_gait(params.multiphase, clock.gait)
         schedule = params.schedule
         nodes = multiphase.build_nodes(settings, schedule, clock, count, shortest)
-        outlook = multiphase.predict(
+        forecast = multiphase.predict(
             settings,
             nodes,
             body.x,
@@ -220,7 +220,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
             settings,
             params.robot,
             nodes,
-            outlook,
+            forecast,
             body.x,
             (body.x[:2] - body.base) @ body.rotation,
             tolerance=spec.tolerance,
@@ -229,7 +229,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
         # A point that misses its rows by a percent still walks better than none; without one, the
         # feet carry what they carry in the periodic motion.
         usable = (solved.status <= qp.Status.ITERATION_LIMIT) & (solved.residual < 1e-2)
-        carry = jnp.stack([jnp.zeros_like(outlook.force_z[0]), outlook.force_z[0]])
+        carry = jnp.stack([jnp.zeros_like(forecast.force_z[0]), forecast.force_z[0]])
         force = jnp.where(usable & task.valid, solved.force[0], carry)
         standing = jnp.arange(2) == nodes.end_index[0]
         return ForcePlan(
@@ -238,7 +238,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
             status=solved.status,
             residual=solved.residual,
             iterations=solved.iterations,
-            reference=outlook.reference[0],
+            reference=forecast.reference[0],
         )
 
     return plan

@@ -43,7 +43,7 @@ def next_reference(
     Args:
       params: command, slew, rates and limits of the integral action.
       state: before.
-      clock: place in the gait now.
+      clock: gait, phase and time in it, now.
       body: as it is now.
       control_dt: of a tick [s].
     """

@@ -83,7 +83,7 @@ def controller_spec(config: RunConfig) -> ControllerSpec:
         model_dt=lmpc.model_dt,
         horizon=lmpc.horizon,
         model=model_spec(config.koopman),
-        discounts_uncertainty=lmpc.caution > 0,
+        discounts_uncertainty=lmpc.uncertainty_discount > 0,
         friction_rows=lmpc.friction < inf,
         torque_rows=lmpc.torque_fraction < inf,
         solver=lmpc.solver,
@@ -206,7 +206,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
     gaits = build_gaits(si)
     names = [one.name for one in gaits]
     leg, sideways = si.leg, si.lateral
-    foresees = cycle_nodes(gaits, si).any(axis=1)
+    uses_gait_cycle = cycle_nodes(gaits, si).any(axis=1)
     problems, index = contact_problems(gaits, si)
 
     return ControllerParams(
@@ -214,7 +214,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
         fits=fits,
         modes=problem_settings(si, problems, names, mean_force(gaits, si, robot)),
         problem=jnp.asarray(index),
-        uncertainty_discount=jnp.asarray(si.lmpc.caution, float),
+        uncertainty_discount=jnp.asarray(si.lmpc.uncertainty_discount, float),
         friction=jnp.asarray(si.lmpc.friction, float),
         torque_fraction=jnp.asarray(si.lmpc.torque_fraction, float),
         schedule=gait.build_schedule(gaits),
@@ -240,11 +240,11 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
             ridge=jnp.asarray(sideways.force_weight),
             friction=jnp.minimum(
                 sideways.friction,
-                jnp.where(foresees, si.multiphase.friction, si.lmpc.friction),
+                jnp.where(uses_gait_cycle, si.multiphase.friction, si.lmpc.friction),
             ),
             torque_fraction=jnp.minimum(
                 1.0,
-                jnp.where(foresees, si.multiphase.torque_fraction, si.lmpc.torque_fraction),
+                jnp.where(uses_gait_cycle, si.multiphase.torque_fraction, si.lmpc.torque_fraction),
             ),
             foothold_gain=jnp.asarray(sideways.foothold_gain),
         ),

@@ -19,7 +19,7 @@ class ControllerState(NamedTuple):
 
     Attributes:
       time: since ``init`` [s].
-      clock: place in the gait.
+      clock: gait, phase and time in it.
       stance: (4,) scheduled stance legs.
       lag: reference of p_x less p_x, the integral of the velocity's error, bounded [m].
       command: (6,) in force now, order of ``types.COMMAND_NAMES``.

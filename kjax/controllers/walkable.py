@@ -61,12 +61,12 @@ def contact_problems(
 
     A gait that predicts through flight has only that of flight.
     """
-    foresees = [bool(row.any()) for row in cycle_nodes(gaits, config)]
+    uses_gait_cycle = [bool(row.any()) for row in cycle_nodes(gaits, config)]
     problems: list[Problem] = []
     index = np.zeros((len(gaits), max(len(one.phases) for one in gaits)), int)
     for g, one in enumerate(gaits):
         for p, phase in enumerate(one.phases):
-            mode = Mode.FLIGHT if foresees[g] else contact_mode(phase.stance)
+            mode = Mode.FLIGHT if uses_gait_cycle[g] else contact_mode(phase.stance)
             problem = Problem(g, mode)
             if problem not in problems:
                 problems.append(problem)

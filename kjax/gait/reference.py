@@ -107,5 +107,5 @@ def _periodic(acceleration: Array, step: np.ndarray) -> tuple[Array, Array]:
     gain = jnp.concatenate([zero, jnp.cumsum(acceleration * step)])
     travel = gain[:-1] * step + 0.5 * acceleration * step**2
     velocity = gain - travel.sum() / step.sum()
-    moved = jnp.cumsum(velocity[:-1] * step + 0.5 * acceleration * step**2)
-    return jnp.concatenate([zero, moved]), velocity
+    displacement = jnp.cumsum(velocity[:-1] * step + 0.5 * acceleration * step**2)
+    return jnp.concatenate([zero, displacement]), velocity

@@ -2,8 +2,8 @@
 
 The paper writes K = G_1 G_2^-1 with G_2 = mean(Pi [Pi; u]^T), which is not square; the regression
 wants the Gram matrix of the full regressor [Pi; u]. We do not form a Gram matrix at all, since it
-squares the condition number: ``regression`` works on the triangle of a QR factorisation, with the
-columns scaled to unit norm, and an SVD of that small triangle reveals the rank. The regression is
+squares the condition number: ``regression`` works on the R of a QR factorisation, with the
+columns scaled to unit norm, and an SVD of that small factor reveals the rank. The regression is
 on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small steps.
 """
 
@@ -58,7 +58,7 @@ class FitReport(NamedTuple):
       condition: ratio of largest to smallest *retained* singular value [-].
       condition_full: the same over all of them; huge where columns repeat [-].
       residual_rms: (6,) one-step residual of each state [m, rad, m/s, rad/s].
-      finite: whether the triangle of all data, and so the data, and all coefficients are finite.
+      finite: whether the QR factor of all data, and so the data, and all coefficients are finite.
     """
 
     rank: Int[Array, ""]
@@ -177,7 +177,7 @@ def _feet_map(weights: Float[Array, "N f"]) -> Float[Array, "4 N 4"]:
     return B_feet.at[2:4, :, 2:4].set(jnp.moveaxis(products[:, 1], 1, 0))
 
 
-def _report(rows: regression.Triangle, weights: regression.Weights) -> FitReport:
+def _report(rows: regression.QrFactor, weights: regression.Weights) -> FitReport:
     sigma, rank = weights.sigma, weights.rank
     smallest = jnp.min(jnp.where(jnp.arange(sigma.shape[0]) < rank, sigma, jnp.inf))
     return FitReport(

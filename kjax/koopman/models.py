@@ -45,8 +45,8 @@ class BilinearModel(NamedTuple):
         self, z: Float[Array, "N"], u: Float[Array, "4"], feet: Float[Array, "2 2"]
     ) -> Float[Array, "N"]:
         """Lifted state one step later."""
-        moved = self.A @ z + jnp.einsum("inm,i,m->n", self.B, z, u)
-        return moved + jnp.einsum("k,knm,m->n", feet.reshape(4), self.B_feet, u)
+        response = self.A @ z + jnp.einsum("inm,i,m->n", self.B, z, u)
+        return response + jnp.einsum("k,knm,m->n", feet.reshape(4), self.B_feet, u)
 
 
 def input_map(model: LinearModel, feet: Float[Array, "2 2"]) -> Float[Array, "N 4"]:

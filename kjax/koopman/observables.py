@@ -122,14 +122,14 @@ def fourier(count: int = 20, *, scale: float = 1.0, seed: int = 0) -> Dictionary
     return _dictionary(extra, tuple(f"cos(w_{i} x + b_{i})" for i in range(count)), ("-",) * count)
 
 
-def own(
+def custom_dictionary(
     function: Callable[[Float[Array, "6"]], Float[Array, "E"]],
     names: Sequence[str] = (),
     units: Sequence[str] = (),
 ) -> Dictionary:
     """Your own observables behind ``[1, x]``.
 
-        kjax.koopman.observables.own(lambda x: jnp.stack([jnp.sin(x[2]), x[5] * x[3]]))
+        custom_dictionary(lambda x: jnp.stack([jnp.sin(x[2]), x[5] * x[3]]))
 
     Args:
       function: from the state (6,) to the observables (E,).
@@ -204,3 +204,9 @@ def _dictionary(
     return Dictionary(
         lift=lift, names=("1", *STATE_NAMES, *names), units=("-", *STATE_UNITS, *units)
     )
+
+
+def __getattr__(name: str) -> object:
+    if name == "own":
+        raise AttributeError("kjax.koopman.observables.own is now custom_dictionary")
+    raise AttributeError(f"module 'kjax.koopman.observables' has no attribute '{name}'")

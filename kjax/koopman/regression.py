@@ -1,8 +1,8 @@
-"""Least squares Z W = Y as a triangle that data runs through: stable, mergeable, of bounded size.
+"""Least squares Z W = Y by an incremental QR factorisation (TSQR): stable, of bounded size.
 
-The triangle is R of the QR factorisation of [Z Y]. It holds all that the fit, its residual and its
+It keeps R of the QR factorisation of [Z Y]. It holds all that the fit, its residual and its
 rank need, it does not square the condition number as a Gram matrix does, and QR of two stacked
-triangles is the triangle of all their rows: snapshots may come in blocks, from several machines, or
+factors is that of all their rows: snapshots may come in blocks, from several machines, or
 one by one as the robot walks (with forgetting), and 10^8 of them need no more memory than ten.
 """
 
@@ -17,11 +17,11 @@ BLOCK = 500  # rows factorised at once: they stay in the cache
 ROUNDING = 20.0  # singular values below so many roundings per column count as zero
 
 
-class Triangle(NamedTuple):
+class QrFactor(NamedTuple):
     """Everything that least squares needs of M rows [Z Y], c + t columns.
 
     Attributes:
-      R: (c + t, c + t) upper triangle with R^T R = [Z Y]^T [Z Y].
+      R: (c + t, c + t) upper triangular, with R^T R = [Z Y]^T [Z Y].
       rows: number of them, fewer where old ones were forgotten.
     """
 
@@ -43,34 +43,34 @@ class Weights(NamedTuple):
     sigma: Float[Array, "c"]
 
 
-def empty(columns: int, targets: int, dtype: jnp.dtype | None = None) -> Triangle:
-    """The triangle of no rows."""
+def empty(columns: int, targets: int, dtype: jnp.dtype | None = None) -> QrFactor:
+    """The QR factor of no rows."""
     size = columns + targets
-    return Triangle(R=jnp.zeros((size, size), dtype), rows=jnp.zeros((), dtype))
+    return QrFactor(R=jnp.zeros((size, size), dtype), rows=jnp.zeros((), dtype))
 
 
 def accumulate(
-    triangle: Triangle,
+    factor: QrFactor,
     Z: Float[Array | np.ndarray, "M c"],
     Y: Float[Array | np.ndarray, "M t"],
     *,
     forget: float | Float[Array, ""] = 1.0,
-) -> Triangle:
-    """The triangle with M rows more; all older rows first lose weight by ``forget`` (0 to 1]."""
+) -> QrFactor:
+    """The QR factor with M rows more; all older rows first lose weight by ``forget`` (0 to 1]."""
     new = jnp.concatenate([jnp.asarray(Z), jnp.asarray(Y)], axis=1)
-    old = jnp.sqrt(jnp.asarray(forget, new.dtype)) * triangle.R
+    old = jnp.sqrt(jnp.asarray(forget, new.dtype)) * factor.R
     R = jnp.linalg.qr(jnp.concatenate([old, new]), mode="r")
-    return Triangle(R=R[: old.shape[0]], rows=forget * triangle.rows + new.shape[0])
+    return QrFactor(R=R[: old.shape[0]], rows=forget * factor.rows + new.shape[0])
 
 
-def merge(one: Triangle, other: Triangle) -> Triangle:
-    """The triangle of the rows of both."""
+def merge(one: QrFactor, other: QrFactor) -> QrFactor:
+    """The QR factor of the rows of both."""
     R = jnp.linalg.qr(jnp.concatenate([one.R, other.R]), mode="r")
-    return Triangle(R=R, rows=one.rows + other.rows)
+    return QrFactor(R=R, rows=one.rows + other.rows)
 
 
-def of_rows(Z: Float[Array | np.ndarray, "M c"], Y: Float[Array | np.ndarray, "M t"]) -> Triangle:
-    """The triangle of M rows, fewer than columns or more."""
+def of_rows(Z: Float[Array | np.ndarray, "M c"], Y: Float[Array | np.ndarray, "M t"]) -> QrFactor:
+    """The QR factor of M rows, fewer than columns or more."""
     rows = jnp.concatenate([jnp.asarray(Z), jnp.asarray(Y)], axis=1)
     count, size = rows.shape
     if count > 4 * BLOCK and size < BLOCK // 2:
@@ -79,11 +79,11 @@ def of_rows(Z: Float[Array | np.ndarray, "M c"], Y: Float[Array | np.ndarray, "M
         rows = jax.lax.map(lambda block: jnp.linalg.qr(block, mode="r"), blocks).reshape(-1, size)
     R = jnp.linalg.qr(rows, mode="r")
     R = jnp.zeros((size, size), R.dtype).at[: R.shape[0]].set(R[:size])
-    return Triangle(R=R, rows=jnp.asarray(count, R.dtype))
+    return QrFactor(R=R, rows=jnp.asarray(count, R.dtype))
 
 
 def solve(
-    triangle: Triangle,
+    factor: QrFactor,
     columns: int,
     *,
     ridge: float | Float[Array, ""] = 0.0,
@@ -92,12 +92,12 @@ def solve(
     """Minimum-norm solution in the scaled columns.
 
     Args:
-      triangle: of the rows.
+      factor: of the rows.
       columns: number c of regressors.
       ridge: penalty of |W|^2 in the scaled columns (each of unit length), 0 for none [-].
       use: (c,) regressors to use, a dictionary cut out of a larger one; all if ``None``.
     """
-    R, Y = triangle.R[:columns, :columns], triangle.R[:columns, columns:]
+    R, Y = factor.R[:columns, :columns], factor.R[:columns, columns:]
     if use is not None:
         R = jnp.where(use, R, 0.0)
     norm = jnp.linalg.norm(R, axis=0)
@@ -111,19 +111,19 @@ def solve(
     return Weights(W=W, rank=keep.sum(), sigma=sigma)
 
 
-def rms(triangle: Triangle, W: Float[Array, "c t"]) -> Float[Array, "t"]:
-    """Root mean square of Y - Z W over the triangle's rows; these need not be those of the fit."""
+def rms(factor: QrFactor, W: Float[Array, "c t"]) -> Float[Array, "t"]:
+    """Root mean square of Y - Z W over the factor's rows; these need not be those of the fit."""
     move = jnp.concatenate([-W, jnp.eye(W.shape[1], dtype=W.dtype)])
-    size = jnp.maximum(triangle.rows, 1.0)
-    return jnp.linalg.norm(triangle.R @ move, axis=0) / jnp.sqrt(size)
+    size = jnp.maximum(factor.rows, 1.0)
+    return jnp.linalg.norm(factor.R @ move, axis=0) / jnp.sqrt(size)
 
 
 def block_rows(
-    triangle: Triangle, Z: Float[Array | np.ndarray, "B M c"], Y: Float[Array | np.ndarray, "B M t"]
-) -> Triangle:
+    factor: QrFactor, Z: Float[Array | np.ndarray, "B M c"], Y: Float[Array | np.ndarray, "B M t"]
+) -> QrFactor:
     """B blocks of rows one after the other: the memory of one block."""
 
-    def one(triangle: Triangle, block: tuple[Array, Array]) -> tuple[Triangle, None]:
-        return accumulate(triangle, *block), None
+    def one(factor: QrFactor, block: tuple[Array, Array]) -> tuple[QrFactor, None]:
+        return accumulate(factor, *block), None
 
-    return jax.lax.scan(one, triangle, (jnp.asarray(Z), jnp.asarray(Y)))[0]
+    return jax.lax.scan(one, factor, (jnp.asarray(Z), jnp.asarray(Y)))[0]

@@ -78,19 +78,19 @@ def cautious_weights(
     A: Float[Array, "N N"],
     state_weights: Float[Array, "n_x"],
     spread: Float[Array, "n_x"],
-    caution: Float[Array, ""] | float,
+    uncertainty_discount: Float[Array, ""] | float,
     horizon: int,
 ) -> Float[Array, "k n_x"]:
     """Q of every step, less where the prediction is less certain.
 
     The error of one step, white and of standard deviation s, grows along the horizon to
-    S_i = sum_{j<i} A^j diag(s^2) A^j^T; step i weighs Q / (1 + caution S_i / mean(S)).
+    S_i = sum_{j<i} A^j diag(s^2) A^j^T; step i weighs Q / (1 + discount S_i / mean(S)).
 
     Args:
       A: lifted transition per model step.
       state_weights: diagonal of Q.
       spread: standard deviation of the one-step error, the model's uncertainty.
-      caution: 0 to trust the whole horizon alike [-].
+      uncertainty_discount: 0 to trust the whole horizon alike [-].
       horizon: number k of model steps.
     """
     n_x = state_weights.shape[0]
@@ -105,4 +105,4 @@ def cautious_weights(
     variance = jnp.stack(spreads)
     mean = variance.mean(axis=0)
     ratio = jnp.where(mean > 0, variance / jnp.where(mean > 0, mean, 1.0), 0.0)
-    return state_weights / (1.0 + caution * ratio)
+    return state_weights / (1.0 + uncertainty_discount * ratio)

@@ -148,7 +148,7 @@ def build_nodes(
     )
 
 
-class Outlook(NamedTuple):
+class HorizonForecast(NamedTuple):
     """What is predicted before the QP: where the body will be and what it shall do.
 
     Attributes:
@@ -179,7 +179,7 @@ def predict(
     contact: Float[Array, "2 2"],
     stance_time: Float[Array, "K"],
     cycle_time: Float[Array, ""],
-) -> Outlook:
+) -> HorizonForecast:
     """Reference, path of the centre of mass and footholds over the horizon.
 
     Args:
@@ -243,7 +243,7 @@ def predict(
     load = share * params.mass * GRAVITY * cycle_time / stance_time
     standing = nodes.feet > 0
     force_z = jnp.where(standing, load / jnp.maximum(nodes.feet, 1.0), 0.0)
-    return Outlook(reference=reference, path=path, foot=foot, force_z=force_z)
+    return HorizonForecast(reference=reference, path=path, foot=foot, force_z=force_z)
 
 
 class MultiPhasePlan(NamedTuple):
@@ -268,7 +268,7 @@ def solve(
     params: MultiPhaseParams,
     robot: RobotParams,
     nodes: Nodes,
-    outlook: Outlook,
+    forecast: HorizonForecast,
     x: Float[Array, "6"],
     lever: Float[Array, "2"],
     *,
@@ -281,27 +281,27 @@ def solve(
       params: weights and limits.
       robot: for the joint torque limits.
       nodes: grid.
-      outlook: from ``predict``.
+      forecast: from ``predict``.
       x: state now.
       lever: (2,) centre of mass in the trunk frame [m].
       tolerance: of the QP.
       max_iterations: of the QP.
     """
     K = nodes.length.shape[0]
-    free, forced = response(params, nodes, outlook, x)
+    free, forced = response(params, nodes, forecast, x)
     weight = params.state_weights * nodes.length[:, None]
     B = forced.reshape(6 * K, 2 * K)
     weighted = B * weight.reshape(-1)[:, None]
     R = jnp.repeat(params.input_weight * nodes.length, 2)
-    wish = jnp.stack([jnp.zeros_like(outlook.force_z), outlook.force_z], axis=-1).reshape(-1)
+    wish = jnp.stack([jnp.zeros_like(forecast.force_z), forecast.force_z], axis=-1).reshape(-1)
     standing = nodes.feet > 0
     H = 2.0 * (weighted.T @ B + jnp.diag(R))
-    q = 2.0 * (weighted.T @ (free - outlook.reference).reshape(-1) - R * wish)
+    q = 2.0 * (weighted.T @ (free - forecast.reference).reshape(-1) - R * wish)
 
     low = jnp.stack([-params.force_x_max, params.force_z[0]])
     high = jnp.stack([params.force_x_max, params.force_z[1]])
     lower, upper = (jnp.where(standing[:, None], b, 0.0).reshape(-1) for b in (low, high))
-    rows, limit = force_rows(params, robot, nodes, outlook, lever)
+    rows, limit = force_rows(params, robot, nodes, forecast, lever)
     # Node k's rows act on node k's force alone.
     C = jnp.einsum("krf,kl->krlf", rows, jnp.eye(K, dtype=rows.dtype)).reshape(-1, 2 * K)
     limit = jnp.broadcast_to(limit, (K, 4))
@@ -328,7 +328,7 @@ def solve(
 
 
 def response(
-    params: MultiPhaseParams, nodes: Nodes, outlook: Outlook, x: Float[Array, "6"]
+    params: MultiPhaseParams, nodes: Nodes, forecast: HorizonForecast, x: Float[Array, "6"]
 ) -> tuple[Float[Array, "K 6"], Float[Array, "K 6 K 2"]]:
     """States at the nodes' ends without forces, and their derivative by every node's force."""
     t = nodes.end
@@ -341,7 +341,7 @@ def response(
     past = jnp.tril(jnp.ones((K, K), t.dtype))
     gain = past * (nodes.length * nodes.feet)  # (k, j)
     lag = gain * (t[:, None] - nodes.middle)
-    arm = outlook.foot - outlook.path[:, :2]
+    arm = forecast.foot - forecast.path[:, :2]
     # Acceleration (x, z, theta) by (F_x, F_z) of node j; a force ahead of the body lifts the nose.
     by_force = jnp.stack(
         [
@@ -360,19 +360,19 @@ def force_rows(
     params: MultiPhaseParams,
     robot: RobotParams,
     nodes: Nodes,
-    outlook: Outlook,
+    forecast: HorizonForecast,
     lever: Float[Array, "2"],
 ) -> tuple[Float[Array, "K 4 2"], Float[Array, "4"]]:
     """Rows on each node's force and their limits: two of friction, thigh and calf torque.
 
-    The posture is the one that puts a foot on its contact point with the trunk where ``outlook``
+    The posture is the one that puts a foot on its contact point with the trunk where ``forecast``
     expects it.
     """
-    theta = outlook.path[:, 2]
+    theta = forecast.path[:, 2]
     c, s = jnp.cos(theta), jnp.sin(theta)
     to_body = jnp.stack([jnp.stack([c, s], -1), jnp.stack([-s, c], -1)], axis=-2)
-    centre = outlook.foot + jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
-    local = jnp.einsum("kij,kj->ki", to_body, centre - outlook.path[:, :2]) + lever
+    centre = forecast.foot + jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+    local = jnp.einsum("kij,kj->ki", to_body, centre - forecast.path[:, :2]) + lever
     hip = robot.hip_pos[::2, ::2][nodes.end_index]
     trig: LegTrig = jax.lax.optimization_barrier(inverse(robot, local - hip)[2])
     torque = jnp.einsum("kij,kil->kjl", foot_jacobian(robot, trig), to_body)  # J^T R^T

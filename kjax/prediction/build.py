@@ -17,16 +17,16 @@ from kjax.types import MODE_ALPHA, Mode
 
 
 class Prediction(NamedTuple):
-    """Numbers of a prediction model, stacked over contact modes; data.
+    """Parameters of a prediction model, stacked over contact modes; data.
 
     Attributes:
-      numbers: of the family.
+      params: of the family.
       force: (M, 4) force per leg about which it is linearised, body frame [N].
       spread: (M, 6) standard deviation of the one-step error; the model's uncertainty
         [m, rad, m/s, rad/s].
     """
 
-    numbers: Any
+    params: Any
     force: Float[Array, "M 4"]
     spread: Float[Array, "M 6"]
 
@@ -85,5 +85,5 @@ def build_prediction(
     if make is None:
         raise ValueError(f"model '{config.model}' has its own tables (edmd.fit_modes)")
     alpha = jnp.asarray(MODE_ALPHA[np.array(modes)], float)
-    numbers, spread = make(config, Bodies(body, alpha, modes, heights, key))
-    return Prediction(numbers=numbers, force=jax.vmap(families.hover)(body, alpha), spread=spread)
+    params, spread = make(config, Bodies(body, alpha, modes, heights, key))
+    return Prediction(params=params, force=jax.vmap(families.hover)(body, alpha), spread=spread)

@@ -139,7 +139,7 @@ QUANTILES = (0.5, 0.9, 0.99)
 
 def open_loop(
     family: families.Family,
-    numbers: Any,
+    params: Any,
     start: families.Start,
     inputs: Float[Array, "steps 4"],
     *,
@@ -150,14 +150,14 @@ def open_loop(
     The force of that linearisation is the mean of the inputs.
     """
     if not frozen:
-        return families.rollout(family, numbers, start, inputs)
-    here = families.operating_point(family, numbers, start, inputs.mean(axis=0))
-    return rollout(here, family.lift(numbers, start), inputs, start.feet)
+        return families.rollout(family, params, start, inputs)
+    here = families.operating_point(family, params, start, inputs.mean(axis=0))
+    return rollout(here, family.lift(params, start), inputs, start.feet)
 
 
 def model_errors(
     family: families.Family,
-    numbers: Any,
+    params: Any,
     plant: srb_planar.Plant,
     body: srb_planar.SrbParams,
     alpha: Float[Array, "2"],
@@ -169,7 +169,7 @@ def model_errors(
     """Predicted minus true states of every start under every force profile, open loop."""
 
     def one(x0: Array, u: Array) -> Array:
-        predicted = open_loop(family, numbers, families.Start(x0, body.feet), u, frozen=frozen)
+        predicted = open_loop(family, params, families.Start(x0, body.feet), u, frozen=frozen)
         return (predicted - srb_planar.trajectory(plant, body, alpha, x0, u, family.dt))[1:]
 
     return jax.vmap(lambda x0: jax.vmap(lambda u: one(x0, u))(inputs))(starts)
@@ -198,7 +198,7 @@ def bootstrap(
     Args:
       key: random key.
       errors: (episodes, ...) what the statistic is of.
-      statistic: from such an array to numbers.
+      statistic: from such an array to parameters.
       draws: resamples.
       level: of the interval.
 

@@ -1,6 +1,6 @@
 """One interface for every prediction model: lift, step, roll out, linearise.
 
-A *family* is a kind of model as pure functions of its numbers; the numbers are data, stacked over
+A *family* is a kind of model as pure functions of its parameters; these are data, stacked over
 contact modes. Every lifted state z begins with the constant 1 and the state x itself, so that an
 affine model is a linear one and the state is read off. The LMPC takes any family: at each tick it
 linearises it where the robot is (``operating_point``), which for a linear family changes nothing.
@@ -36,15 +36,15 @@ class Start(NamedTuple):
       x: (6,) state [m, rad, m/s, rad/s].
       feet: (2, 2) contact points (front, rear) from the centre of mass, body frame [m].
       u_before: (4,) force of the same legs in the step before; 0 if ``None`` [N].
-      turn: place in the stance, 0 at its beginning and pi at its end [rad].
-      turn_rate: its change [rad/s].
+      stance_phase: 0 at the beginning of the stance and pi at its end [rad].
+      stance_phase_rate: its change [rad/s].
     """
 
     x: Float[Array, "6"]
     feet: Float[Array, "2 2"]
     u_before: Float[Array, "4"] | None = None
-    turn: Float[Array, ""] | float = 0.0
-    turn_rate: Float[Array, ""] | float = 0.0
+    stance_phase: Float[Array, ""] | float = 0.0
+    stance_phase_rate: Float[Array, ""] | float = 0.0
 
 
 class Past(NamedTuple):
@@ -52,15 +52,15 @@ class Past(NamedTuple):
 
     Attributes:
       u_before: (4,) force of the same legs in the step before [N].
-      waves: (4,) place in the stance, ``waves_of``.
+      harmonics: (4,) of the stance phase, ``phase_harmonics``.
     """
 
     u_before: Float[Array, "4"]
-    waves: Float[Array, "4"]
+    harmonics: Float[Array, "4"]
 
 
 class BodyModel(NamedTuple):
-    """Numbers of the families that know the rigid body.
+    """Parameters of the families that know the rigid body.
 
     Attributes:
       body: mass, inertia, nominal contact points.
@@ -75,7 +75,7 @@ class ResidualModel(NamedTuple):
     """x+ = planted(x, u) + W phi.
 
     Attributes:
-      nominal: numbers of the planted body.
+      nominal: parameters of the planted body.
       W: (6, F) weights of the features.
     """
 
@@ -90,8 +90,8 @@ class Family(NamedTuple):
       name: as configs call it.
       dt: one step [s].
       observables: names of the lifted state's entries.
-      lift: (numbers, start) -> z (N,).
-      step: (numbers, start, z, u) -> z one step later; u (4,) is the force per leg in the body
+      lift: (parameters, start) -> z (N,).
+      step: (parameters, start, z, u) -> z one step later; u (4,) is the force per leg in the body
         frame, of which ``exact`` takes the one at the start.
     """
 
@@ -108,21 +108,21 @@ class Family(NamedTuple):
 
 
 def linear(dictionary: Dictionary, dt: float, name: str = "linear") -> Family:
-    """Linear models in a dictionary's observables; numbers are a ``LinearModel``."""
+    """Linear models in a dictionary's observables; parameters are a ``LinearModel``."""
     _require_one_state(dictionary)
 
-    def step(numbers: LinearModel, start: Start, z: Array, u: Array) -> Array:
-        return numbers.A @ z + input_map(numbers, start.feet) @ u
+    def step(params: LinearModel, start: Start, z: Array, u: Array) -> Array:
+        return params.A @ z + input_map(params, start.feet) @ u
 
     return Family(name, dt, dictionary.names, lambda _, start: dictionary.lift(start.x), step)
 
 
 def bilinear(dictionary: Dictionary, dt: float) -> Family:
-    """Bilinear models in a dictionary's observables; numbers are a ``BilinearModel``."""
+    """Bilinear models in a dictionary's observables; parameters are a ``BilinearModel``."""
     _require_one_state(dictionary)
 
-    def step(numbers: BilinearModel, start: Start, z: Array, u: Array) -> Array:
-        return numbers.step(z, u, start.feet)
+    def step(params: BilinearModel, start: Start, z: Array, u: Array) -> Array:
+        return params.step(z, u, start.feet)
 
     return Family("bilinear", dt, dictionary.names, lambda _, start: dictionary.lift(start.x), step)
 
@@ -136,20 +136,20 @@ def _require_one_state(dictionary: Dictionary) -> None:
 
 
 def rigid_body(dt: float) -> Family:
-    """``srb``: the rigid body itself, contact points fixed in the body; numbers: ``BodyModel``."""
+    """``srb``: the rigid body, contact points fixed in the body; parameters: ``BodyModel``."""
 
-    def step(numbers: BodyModel, start: Start, z: Array, u: Array) -> Array:
-        body = numbers.body._replace(feet=start.feet)
-        return _with_one(srb_planar.rk4_step(body, numbers.alpha, z[STATE_ROWS], u, dt))
+    def step(params: BodyModel, start: Start, z: Array, u: Array) -> Array:
+        body = params.body._replace(feet=start.feet)
+        return _with_one(srb_planar.rk4_step(body, params.alpha, z[STATE_ROWS], u, dt))
 
     return Family("srb", dt, states_only().names, _lift_state, step)
 
 
 def planted(dt: float) -> Family:
-    """``planted``: the rigid body on feet that stay where they are; numbers: ``BodyModel``."""
+    """``planted``: the rigid body on feet that stay where they are; parameters: ``BodyModel``."""
 
-    def step(numbers: BodyModel, start: Start, z: Array, u: Array) -> Array:
-        return _with_one(_planted_step(numbers, start, z[STATE_ROWS], u, dt))
+    def step(params: BodyModel, start: Start, z: Array, u: Array) -> Array:
+        return _with_one(_planted_step(params, start, z[STATE_ROWS], u, dt))
 
     return Family("planted", dt, states_only().names, _lift_state, step)
 
@@ -166,11 +166,9 @@ def exact(dt: float) -> Family:
     the frame that the body has at the start.
     """
 
-    def step(numbers: BodyModel, start: Start, z: Array, u: Array) -> Array:
-        x, m, inertia = z[STATE_ROWS], numbers.body.mass, numbers.body.inertia
-        force = (numbers.alpha[:, None] * u.reshape(2, 2)) @ srb_planar.planar_rotation(
-            start.x[2]
-        ).T
+    def step(params: BodyModel, start: Start, z: Array, u: Array) -> Array:
+        x, m, inertia = z[STATE_ROWS], params.body.mass, params.body.inertia
+        force = (params.alpha[:, None] * u.reshape(2, 2)) @ srb_planar.planar_rotation(start.x[2]).T
         total = force.sum(axis=0)
         accel = total / m - jnp.array([0.0, GRAVITY], x.dtype)
         p, v = x[:2], x[3:5]
@@ -195,7 +193,7 @@ def residual(
     *,
     remembers: bool = True,
 ) -> Family:
-    """``residual``: the planted body and what data adds to it; numbers: ``ResidualModel``.
+    """``residual``: the planted body and what data adds to it; parameters: ``ResidualModel``.
 
     The lifted state holds the force of the step before, a delay coordinate, and the place in the
     stance as four waves. These turn at a constant rate, which is linear: so a drift that changes
@@ -216,25 +214,34 @@ def residual(
         if not remembers:
             return one
         before = jnp.zeros((4,), one.dtype) if start.u_before is None else start.u_before
-        return jnp.concatenate([one, before, waves_of(jnp.asarray(start.turn, one.dtype))])
+        return jnp.concatenate(
+            [one, before, phase_harmonics(jnp.asarray(start.stance_phase, one.dtype))]
+        )
 
-    def step(numbers: ResidualModel, start: Start, z: Array, u: Array) -> Array:
+    def step(params: ResidualModel, start: Start, z: Array, u: Array) -> Array:
         x = z[STATE_ROWS]
         past = Past(z[state:last], z[last:]) if remembers else Past(jnp.zeros(4), jnp.zeros(4))
-        nominal = _planted_step(numbers.nominal, start, x, u, dt)
-        moved = _with_one(nominal + numbers.W @ features(start, x, u, past))
+        nominal = _planted_step(params.nominal, start, x, u, dt)
+        next_state = _with_one(nominal + params.W @ features(start, x, u, past))
         if not remembers:
-            return moved
-        single = _turned(past.waves[:2], start.turn_rate * dt)
-        double = _turned(past.waves[2:], 2 * start.turn_rate * dt)
-        return jnp.concatenate([moved, u, single, double])
+            return next_state
+        single = _turned(past.harmonics[:2], start.stance_phase_rate * dt)
+        double = _turned(past.harmonics[2:], 2 * start.stance_phase_rate * dt)
+        return jnp.concatenate([next_state, u, single, double])
 
     return Family("residual", dt, names if remembers else plain, lift, step)
 
 
-def waves_of(turn: Float[Array, "*V"]) -> Float[Array, "4 *V"]:
-    """Sine and cosine of the place in the stance (0 to pi) and of its double."""
-    return jnp.stack([jnp.sin(turn), jnp.cos(turn), jnp.sin(2 * turn), jnp.cos(2 * turn)])
+def phase_harmonics(stance_phase: Float[Array, "*V"]) -> Float[Array, "4 *V"]:
+    """Sine and cosine of the stance phase (0 to pi) and of its double."""
+    return jnp.stack(
+        [
+            jnp.sin(stance_phase),
+            jnp.cos(stance_phase),
+            jnp.sin(2 * stance_phase),
+            jnp.cos(2 * stance_phase),
+        ]
+    )
 
 
 def _turned(wave: Float[Array, "2"], angle: Array | float) -> Float[Array, "2"]:
@@ -256,29 +263,29 @@ def affine_features(start: Start, x: Array, u: Array) -> Float[Array, "17"]:
 
 
 def rollout(
-    family: Family, numbers: Any, start: Start, inputs: Float[Array, "steps 4"]
+    family: Family, params: Any, start: Start, inputs: Float[Array, "steps 4"]
 ) -> Float[Array, "steps_plus_1 6"]:
     """Predicted states (steps + 1, 6); lifted once, at the start."""
 
     def one(z: Array, u: Array) -> tuple[Array, Array]:
-        z = family.step(numbers, start, z, u)
+        z = family.step(params, start, z, u)
         return z, z[STATE_ROWS]
 
-    _, states = jax.lax.scan(one, family.lift(numbers, start), inputs)
+    _, states = jax.lax.scan(one, family.lift(params, start), inputs)
     return jnp.concatenate([start.x[None], states])
 
 
 def operating_point(
-    family: Family, numbers: Any, start: Start, u: Float[Array, "4"], steps: int = 1
+    family: Family, params: Any, start: Start, u: Float[Array, "4"], steps: int = 1
 ) -> LinearModel:
     """The model linearised at the start under the force ``u``, over ``steps`` of its steps at once.
 
     Exact for a linear family. What is left over by the linearisation goes to the column of the
     constant observable.
     """
-    z = family.lift(numbers, start)
-    value = family.step(numbers, start, z, u)
-    A, B = jax.jacfwd(family.step, argnums=(2, 3))(numbers, start, z, u)
+    z = family.lift(params, start)
+    value = family.step(params, start, z, u)
+    A, B = jax.jacfwd(family.step, argnums=(2, 3))(params, start, z, u)
     A = A.at[:, 0].add(value - A @ z - B @ u)
     none = jnp.zeros((4, *B.shape), B.dtype)
     return aggregate(LinearModel(A=A, B=B, B_feet=none), steps)
@@ -299,18 +306,18 @@ def linearised_srb(
     height: Float[Array, ""] | float,
     dt: float,
 ) -> LinearModel:
-    """Numbers of ``srb_hover``: the rigid body linearised level, at rest, carrying its weight.
+    """Parameters of ``srb_hover``: the rigid body linearised level, at rest, carrying its weight.
 
     The moment is bilinear in contact point and force, so that the dependence of B on the contact
     points is exact.
     """
     family = rigid_body(dt)
-    numbers = BodyModel(body, alpha)
+    params = BodyModel(body, alpha)
     u = hover(body, alpha)
     x = jnp.zeros((STATE_DIM,), u.dtype).at[1].set(height)
 
     def at(feet: Array) -> LinearModel:
-        return operating_point(family, numbers, Start(x, feet), u)
+        return operating_point(family, params, Start(x, feet), u)
 
     here = at(jnp.zeros((2, 2), u.dtype))
     unit = jnp.eye(4, dtype=u.dtype).reshape(4, 2, 2)
@@ -325,8 +332,8 @@ def _with_one(x: Array) -> Array:
     return jnp.concatenate([jnp.ones((1,), x.dtype), x])
 
 
-def _planted_step(numbers: BodyModel, start: Start, x: Array, u: Array, dt: float) -> Array:
+def _planted_step(params: BodyModel, start: Start, x: Array, u: Array, dt: float) -> Array:
     ground = srb_planar.contact_points(start.x, start.feet)
     return srb_planar.rk4(
-        lambda x: srb_planar.planted_dynamics(numbers.body, numbers.alpha, ground, x, u), x, dt
+        lambda x: srb_planar.planted_dynamics(params.body, params.alpha, ground, x, u), x, dt
     )

@@ -1,7 +1,7 @@
 """Features of residual models: what the error of the planted rigid body is a linear map of.
 
-All take (start, x, u, moment). A ``Moment`` comes from recorded episodes; in the LMPC its place is
-taken by a ``families.Past``, which has the same ``u_before`` and ``waves``.
+All take (start, x, u, phase). A ``GaitPhase`` comes from recorded episodes; in the LMPC a
+``families.Past`` stands for it, with the same ``u_before`` and ``harmonics``.
 """
 
 from collections.abc import Callable
@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from kjax.prediction.families import Start, affine_features, waves_of
+from kjax.prediction.families import Start, affine_features, phase_harmonics
 
-# (start, x, u, moment) -> phi (F,)
+# (start, x, u, phase) -> phi (F,)
 Features = Callable[[Start, Array, Array, Any], Float[Array, "F"]]
 
 
-class Moment(NamedTuple):
+class GaitPhase(NamedTuple):
     """Where in the gait a step lies; of many steps with leading axes.
 
     Attributes:
@@ -31,32 +31,32 @@ class Moment(NamedTuple):
     left: Float[Array | np.ndarray, "*V"]
 
     @property
-    def waves(self) -> Float[Array, "4"]:
-        """Place in the phase, as ``families.waves_of``."""
-        return waves_of(jnp.pi * jnp.asarray(self.elapsed / (self.elapsed + self.left)))
+    def harmonics(self) -> Float[Array, "4"]:
+        """Harmonics of the phase, ``families.phase_harmonics``."""
+        return phase_harmonics(jnp.pi * jnp.asarray(self.elapsed / (self.elapsed + self.left)))
 
 
-def affine(start: Start, x: Array, u: Array, moment: Any) -> Float[Array, "17"]:
+def affine(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "17"]:
     """``families.affine_features``."""
     return affine_features(start, x, u)
 
 
-def clock(start: Start, x: Array, u: Array, moment: Any) -> Float[Array, "25"]:
-    """Affine, and the place in the phase: waves over it, alone and times v_x.
+def clock(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "25"]:
+    """Affine, and harmonics of the phase, alone and times v_x.
 
     The legs in the air swing as fast as the robot walks, and their inertia turns the body.
     """
-    return jnp.concatenate([affine_features(start, x, u), _turning(x, moment)])
+    return jnp.concatenate([affine_features(start, x, u), _turning(x, phase)])
 
 
-def history(start: Start, x: Array, u: Array, moment: Any) -> Float[Array, "21"]:
+def history(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "21"]:
     """Affine, and the force of the tick before: joints and contacts yield, so forces lag."""
-    return jnp.concatenate([affine_features(start, x, u), moment.u_before])
+    return jnp.concatenate([affine_features(start, x, u), phase.u_before])
 
 
-def clock_history(start: Start, x: Array, u: Array, moment: Any) -> Float[Array, "29"]:
-    """Affine, the place in the phase and the force before."""
-    return jnp.concatenate([affine_features(start, x, u), moment.u_before, _turning(x, moment)])
+def clock_history(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "29"]:
+    """Affine, harmonics of the phase and the force before."""
+    return jnp.concatenate([affine_features(start, x, u), phase.u_before, _turning(x, phase)])
 
 
 # Those that an LMPC can predict with.
@@ -73,17 +73,17 @@ def touchdown(dt: float, ticks: int = 3) -> Features:
       ticks: before the end of a phase and after its beginning.
     """
 
-    def features(start: Start, x: Array, u: Array, moment: Moment) -> Array:
+    def features(start: Start, x: Array, u: Array, phase: GaitPhase) -> Array:
         count = jnp.arange(ticks)
-        after = jnp.round(moment.elapsed / dt) == count
-        before = jnp.round(moment.left / dt) == count + 1
+        after = jnp.round(phase.elapsed / dt) == count
+        before = jnp.round(phase.left / dt) == count + 1
         near = jnp.concatenate([after, before]).astype(x.dtype)
         slopes = (near[:, None] * jnp.stack([x[2], x[4], x[5]])).reshape(-1)
         lost = (near[:ticks, None] * u).reshape(-1)  # a foot that is late carries nothing
-        return jnp.concatenate([clock_history(start, x, u, moment), near, slopes, lost])
+        return jnp.concatenate([clock_history(start, x, u, phase), near, slopes, lost])
 
     return features
 
 
-def _turning(x: Array, moment: Any) -> Float[Array, "8"]:
-    return jnp.concatenate([moment.waves, x[3] * moment.waves])
+def _turning(x: Array, phase: Any) -> Float[Array, "8"]:
+    return jnp.concatenate([phase.harmonics, x[3] * phase.harmonics])

@@ -32,7 +32,7 @@ class Layer(NamedTuple):
 
 
 class LearnedModel(NamedTuple):
-    """Numbers of a learned model.
+    """Parameters of a learned model.
 
     Attributes:
       layers: of the network; tanh between them, none after the last.
@@ -54,7 +54,7 @@ class Training(NamedTuple):
       loss: (updates,) training loss: mean square of the many-step error of all states, in units of
         how far each of them moves [-].
       held_out: (updates // every,) the same on held-out rollouts, ``extra_loss`` included.
-      diverged: whether the loss left the finite numbers; the model is the best one before.
+      diverged: whether the loss left the finite parameters; the model is the best one before.
     """
 
     loss: Float[Array, "updates"]
@@ -63,19 +63,19 @@ class Training(NamedTuple):
 
 
 def learned(dt: float, features: int) -> Family:
-    """``learned``: numbers are a ``LearnedModel`` with so many learned observables."""
+    """``learned``: parameters are a ``LearnedModel`` with so many learned observables."""
     names = ("1", *STATE_NAMES, *(f"learned {i}" for i in range(features)))
 
-    def step(numbers: LearnedModel, start: Start, z: Array, u: Array) -> Array:
-        return numbers.head.step(z, u, start.feet)
+    def step(params: LearnedModel, start: Start, z: Array, u: Array) -> Array:
+        return params.head.step(z, u, start.feet)
 
-    return Family("learned", dt, names, lambda numbers, start: lift(numbers, start.x), step)
+    return Family("learned", dt, names, lambda params, start: lift(params, start.x), step)
 
 
-def lift(numbers: LearnedModel, x: Float[Array, "6"]) -> Float[Array, "N"]:
+def lift(params: LearnedModel, x: Float[Array, "6"]) -> Float[Array, "N"]:
     """Lifted state [1, x, MLP(x)]."""
-    a = ((x - numbers.centre) / numbers.scale)[1:]
-    *inner, last = numbers.layers
+    a = ((x - params.centre) / params.scale)[1:]
+    *inner, last = params.layers
     for layer in inner:
         a = jnp.tanh(layer.W @ a + layer.b)
     a = last.W @ a + last.b
@@ -110,13 +110,13 @@ def initial(
     )
     N = 1 + STATE_DIM + features
     empty = BilinearModel(*(jnp.zeros(s, dtype) for s in ((N, N), (N, N, 4), (4, N, 4))))
-    numbers = LearnedModel(layers, empty, centre, scale)
-    return numbers._replace(head=_least_squares(numbers, data, head))
+    params = LearnedModel(layers, empty, centre, scale)
+    return params._replace(head=_least_squares(params, data, head))
 
 
-def _least_squares(numbers: LearnedModel, data: Snapshots, head: Head) -> BilinearModel:
+def _least_squares(params: LearnedModel, data: Snapshots, head: Head) -> BilinearModel:
     """The head that fits one step best, network as it is; a small ridge keeps it tame."""
-    lifted = jax.vmap(jax.vmap(lambda x: lift(numbers, x)))(data.states)
+    lifted = jax.vmap(jax.vmap(lambda x: lift(params, x)))(data.states)
     now, then = lifted[:, :-1], lifted[:, 1:]
     N = now.shape[-1]
     if head == "bilinear":
@@ -138,33 +138,33 @@ def _least_squares(numbers: LearnedModel, data: Snapshots, head: Head) -> Biline
     return BilinearModel(A=jnp.eye(N, dtype=K.dtype) + K[:, :N], B=B, B_feet=none)
 
 
-def _units(numbers: LearnedModel, data: Snapshots) -> tuple[tuple[Layer, ...], BilinearModel]:
+def _units(params: LearnedModel, data: Snapshots) -> tuple[tuple[Layer, ...], BilinearModel]:
     """What a change of 1 means for each trained number: that of the network's is its own.
 
     An entry of the head is measured by the change of its observable in a step over the size of
     what it multiplies: one rate then suits a velocity's response to a newton and a wave's decay.
     """
-    lifted = jax.vmap(jax.vmap(lambda x: lift(numbers, x)))(data.states)
+    lifted = jax.vmap(jax.vmap(lambda x: lift(params, x)))(data.states)
     change = jnp.diff(lifted, axis=1).std(axis=(0, 1))
     size = jnp.sqrt((lifted**2).mean(axis=(0, 1)))
     force = data.inputs.std(axis=(0, 1))
     A = change[:, None] / (size + 1e-9)
     B = A[:, :, None].swapaxes(0, 1) / (force + 1e-9)
-    layers = jax.tree.map(jnp.ones_like, numbers.layers)
-    return layers, BilinearModel(A, B, jnp.zeros_like(numbers.head.B_feet))
+    layers = jax.tree.map(jnp.ones_like, params.layers)
+    return layers, BilinearModel(A, B, jnp.zeros_like(params.head.B_feet))
 
 
 def prediction_loss(
-    numbers: LearnedModel, data: Snapshots, unit: Float[Array, "6"]
+    params: LearnedModel, data: Snapshots, unit: Float[Array, "6"]
 ) -> Float[Array, ""]:
     """Mean square over rollouts, steps and states of the many-step error in ``unit``."""
 
     def one(states: Array, inputs: Array, feet: Array) -> Array:
         def step(z: Array, u: Array) -> tuple[Array, Array]:
-            z = numbers.head.step(z, u, feet)
+            z = params.head.step(z, u, feet)
             return z, z[STATE_ROWS]
 
-        _, predicted = jax.lax.scan(step, lift(numbers, states[0]), inputs)
+        _, predicted = jax.lax.scan(step, lift(params, states[0]), inputs)
         return jnp.mean(((predicted - states[1:]) / unit) ** 2)
 
     return jax.vmap(one)(*data).mean()
@@ -215,21 +215,21 @@ def train(
         raise ValueError(f"data must hold at least 2 rollouts, got {rollouts}")
     test, fit = (jax.tree.map(lambda a, s=s: a[s], data) for s in (slice(held), slice(held, None)))
     key_init, key_loop = jax.random.split(key)
-    numbers = initial(key_init, fit, hidden=hidden, features=features, head=head)
+    params = initial(key_init, fit, hidden=hidden, features=features, head=head)
     change = data.states[:, window:] - data.states[:, :-window]
     unit = change.std(axis=(0, 1)) + 1e-9
     short = test._replace(states=test.states[:, : window + 1], inputs=test.inputs[:, :window])
 
-    def free(numbers: LearnedModel) -> Any:
+    def free(params: LearnedModel) -> Any:
         """What is trained: layers and head; where the head is linear, no products."""
-        return numbers.layers, numbers.head
+        return params.layers, params.head
 
     def loss(parts: Any, key: Array) -> Array:
         layers, maps = parts
         if head == "linear":
             maps = maps._replace(B=jnp.zeros_like(maps.B).at[0].set(maps.B[0]))
         maps = maps._replace(B_feet=jnp.zeros_like(maps.B_feet))
-        model = numbers._replace(layers=layers, head=maps)
+        model = params._replace(layers=layers, head=maps)
         row, place = jax.random.split(key)
         which = jax.random.randint(row, (batch,), 0, rollouts - held)
         begin = jax.random.randint(place, (batch,), 0, steps - window + 1)
@@ -250,7 +250,7 @@ def train(
 
     schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.01)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
-    units = _units(numbers, fit)
+    units = _units(params, fit)
 
     def scaled(parts: Any) -> Any:
         return jax.tree.map(jnp.multiply, parts, units)
@@ -264,7 +264,7 @@ def train(
     def stretch(carry: Any, keys: Array) -> tuple[Any, tuple[Array, Array]]:
         inner, best, best_value = carry
         inner, values = jax.lax.scan(update, inner, keys)
-        now = numbers._replace(layers=inner[0][0], head=inner[0][1])
+        now = params._replace(layers=inner[0][0], head=inner[0][1])
         value = judged(now)
         better = value < best_value  # NaN is never better
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), inner[0], best)
@@ -272,11 +272,11 @@ def train(
 
     checks = max(1, updates // every)
     keys = jax.random.split(key_loop, (checks, min(every, updates)))
-    first = judged(numbers)
-    parts = free(numbers)
+    first = judged(params)
+    parts = free(params)
     (_, best, _), (losses, held_out) = jax.lax.scan(
         stretch, ((parts, optimiser.init(parts)), parts, first), keys
     )
-    model = numbers._replace(layers=best[0], head=best[1])
+    model = params._replace(layers=best[0], head=best[1])
     losses = losses.reshape(-1)
     return model, Training(losses, held_out, ~jnp.isfinite(losses).all())

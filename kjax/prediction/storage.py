@@ -24,14 +24,14 @@ class Stored(NamedTuple):
     Attributes:
       family: ``"residual"`` or ``"learned"``.
       dt: step of the model [s].
-      numbers: W (M, 6, F) of a residual, or a ``LearnedModel``; a leading axis over ``Mode``.
+      params: W (M, 6, F) of a residual, or a ``LearnedModel``; a leading axis over ``Mode``.
       spread: (M, 6) standard deviation of the one-step error [m, rad, m/s, rad/s].
       features: that the weights of a residual belong to, a name of ``features.BY_NAME``.
     """
 
     family: str
     dt: float
-    numbers: Any
+    params: Any
     spread: np.ndarray
     features: str = "affine"
 
@@ -52,9 +52,9 @@ def save(path: str | Path, stored: Stored) -> Path:
         "spread": np.asarray(stored.spread),
     }
     if stored.family == "residual":
-        arrays |= {"W": np.asarray(stored.numbers), "features": np.array(stored.features)}
+        arrays |= {"W": np.asarray(stored.params), "features": np.array(stored.features)}
     elif stored.family == "learned":
-        model: LearnedModel = stored.numbers
+        model: LearnedModel = stored.params
         for i, layer in enumerate(model.layers):
             arrays[f"W_{i}"], arrays[f"b_{i}"] = np.asarray(layer.W), np.asarray(layer.b)
         arrays |= {"A": np.asarray(model.head.A), "B": np.asarray(model.head.B)}
@@ -105,9 +105,9 @@ def load(path: str | Path, family: str) -> Stored:
     except ValueError as error:
         raise _fault(file, str(error)) from None
     if family == "residual":
-        numbers: Any = arrays["W"]
+        params: Any = arrays["W"]
     else:
-        numbers = LearnedModel(
+        params = LearnedModel(
             layers=tuple(Layer(arrays[f"W_{i}"], arrays[f"b_{i}"]) for i in range(_layers(arrays))),
             head=BilinearModel(arrays["A"], arrays["B"], arrays["B_feet"]),
             centre=arrays["centre"],
@@ -117,7 +117,7 @@ def load(path: str | Path, family: str) -> Stored:
         values = arrays.get(name, np.ones(()))
         if (values < 0).any() or (least == "above 0" and (values == 0).any()):
             raise _fault(file, f"{name} holds {values.min():g}, wanted values {least}")
-    return Stored(family, float(arrays["dt"]), numbers, arrays["spread"], own)
+    return Stored(family, float(arrays["dt"]), params, arrays["spread"], own)
 
 
 def resolve(path: str | Path) -> Path:

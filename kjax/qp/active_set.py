@@ -265,7 +265,7 @@ def _advance(
     bound_status = jnp.where(drop, bound_status * (1.0 - is_dropped), bound_status)
     y = jnp.where(drop, y * (1.0 - is_dropped), y)
     fails = pending & stuck & ~redundant
-    moved = state._replace(
+    next_state = state._replace(
         stack=stack,
         x=x,
         y=y,
@@ -275,9 +275,9 @@ def _advance(
         infeasible=state.infeasible | fails,
         iterations=state.iterations + pending,
     )
-    chosen = _choose(settings, moved, problem, sizes)
+    chosen = _choose(settings, next_state, problem, sizes)
     # A row that could not be added yet is tried again.
-    again = drop & (moved.iterations < settings.max_iterations)
+    again = drop & (next_state.iterations < settings.max_iterations)
     return chosen._replace(
         chosen=jnp.where(drop, state.chosen, chosen.chosen),
         sign=jnp.where(drop, state.sign, chosen.sign),

@@ -54,13 +54,13 @@ def descend_central_path(
 
     def advance(carry: Any) -> Any:
         point, best, error, count, _ = carry
-        moved, ok = _iterate(problem, point, ridge)
+        next_point, ok = _iterate(problem, point, ridge)
         # Far from complementary it cannot be the solution, and judging costs a fifth of a step.
-        near = _complementarity(problem, moved) <= NEAR * tolerance
-        new = where_needed(near, lambda _, *args: _error(*args), never, problem, moved)
+        near = _complementarity(problem, next_point) <= NEAR * tolerance
+        new = where_needed(near, lambda _, *args: _error(*args), never, problem, next_point)
         better = ok & ((new < error) | jnp.isinf(error))  # the last one, until one is judged
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, best)
-        return moved, best, jnp.where(better, new, error), count + 1, ok
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), next_point, best)
+        return next_point, best, jnp.where(better, new, error), count + 1, ok
 
     _, best, _, count, _ = jax.lax.while_loop(
         unfinished, advance, (start, start, never, jnp.zeros((), jnp.int32), good)
@@ -182,6 +182,6 @@ def _iterate(problem: RowProblem, point: _Point, ridge: float) -> tuple[_Point, 
     )
     a = longest(step)  # step 5
     a = jnp.where(a < 1.0, jnp.maximum(0.99, 1.0 - mu) * a, 1.0)
-    moved = jax.tree.map(lambda v, d: v + a * d, point, step)
-    ok = jnp.stack([jnp.isfinite(leaf).all() for leaf in moved]).all()
-    return jax.tree.map(lambda new, old: jnp.where(ok, new, old), moved, point), ok
+    next_point = jax.tree.map(lambda v, d: v + a * d, point, step)
+    ok = jnp.stack([jnp.isfinite(leaf).all() for leaf in next_point]).all()
+    return jax.tree.map(lambda new, old: jnp.where(ok, new, old), next_point, point), ok

@@ -123,5 +123,5 @@ def _exchange(
     table = table - ((column + unit) * divisor)[:, None] * (row - unit)[None, :]
     new_status = jnp.where((y < lower) | (lower >= upper), -1, 1).astype(side.dtype)
     side = jnp.where(is_pivot, jnp.where(side == 0, new_status, 0), side)
-    moved = state._replace(table=table, side=side, exchanges=count + pending)
-    return _choose(moved, q, lower, upper, weight, limit)
+    next_state = state._replace(table=table, side=side, exchanges=count + pending)
+    return _choose(next_state, q, lower, upper, weight, limit)

@@ -147,9 +147,11 @@ def build_closed_loop(
     def plan(
         tables: Tables, origin: Array, state: LoopState, noise: Noise, sensed: Sensed
     ) -> tuple[LoopState, TickLog]:
-        moved, info = controller.plan(tables, state.controller, sense(noise, sensed))
+        next_state, info = controller.plan(tables, state.controller, sense(noise, sensed))
         if scene.force_noise:
-            moved = moved._replace(force=perturb(moved.force, moved.stance, noise.force))
+            next_state = next_state._replace(
+                force=perturb(next_state.force, next_state.stance, noise.force)
+            )
         true = see(sensed)
         true = true._replace(base_pos=true.base_pos - origin.astype(true.base_pos.dtype))
         body = base.view(tables.params.robot, state.track, true).planar
@@ -158,25 +160,25 @@ def build_closed_loop(
             x=body.x,
             feet=body.feet,
             foot_force=sensed.sensordata[jnp.asarray(at.foot_force)],
-            gait=moved.clock.gait,
-            stance=moved.stance,
-            force=moved.force,
-            velocity_command=moved.command[0],
-            velocity_reference=moved.velocity,
+            gait=next_state.clock.gait,
+            stance=next_state.stance,
+            force=next_state.force,
+            velocity_command=next_state.command[0],
+            velocity_reference=next_state.velocity,
             status=info.status,
             residual=info.residual,
             iterations=info.iterations,
             alive=alive,
         )
-        return LoopState(moved, state.track, alive), log
+        return LoopState(next_state, state.track, alive), log
 
     def act(
         tables: Tables, state: LoopState, noise: Noise, sensed: Sensed
     ) -> tuple[LoopState, Array]:
-        moved, command = controller.act(tables, state.controller, sense(noise, sensed))
+        next_state, command = controller.act(tables, state.controller, sense(noise, sensed))
         torque = jnp.where(state.alive, command.torque, 0.0)
         torque = jnp.asarray(at.sign) * torque
-        return state._replace(controller=moved), torque.reshape(-1)[order]
+        return state._replace(controller=next_state), torque.reshape(-1)[order]
 
     return ClosedLoop(noise=noise, init=init, plan=plan, act=act)
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from kjax.dynamics import srb_planar
 from kjax.koopman.models import rollout
 from kjax.prediction.families import Family, operating_point
-from kjax.prediction.features import Features, Moment, affine
+from kjax.prediction.features import Features, GaitPhase, affine
 from kjax.sysid.transitions import Transitions
 from kjax.sysid.whole_body import planted, read, start_at
 from kjax.types import MODE_ALPHA, STATE_DIM, Mode
@@ -32,7 +32,7 @@ class Windows(NamedTuple):
     Attributes:
       x: (V, H + 1, 6) true states.
       u: (V, H, 4) force of one front and one rear leg [N].
-      moment: (V, H, ...) place in the gait.
+      phase: (V, H, ...) gait phase.
       mode: (V, H) scheduled contact mode.
       new: (V, H) whether other feet stand than in the tick before.
       ground: (V, 2, 2) contact points at the start, world [m].
@@ -44,7 +44,7 @@ class Windows(NamedTuple):
 
     x: Float[np.ndarray, "V H_plus_1 6"]
     u: Float[np.ndarray, "V H 4"]
-    moment: Moment
+    phase: GaitPhase
     mode: Int[np.ndarray, "V H"]
     new: Bool[np.ndarray, "V H"]
     ground: Float[np.ndarray, "V 2 2"]
@@ -84,7 +84,7 @@ def windows(data: Transitions, length: int, *, inside: bool, stride: int = 1) ->
     return Windows(
         x=np.concatenate([data.x[at], data.x_next[at[:, -1:]]], axis=1),
         u=data.u[at],
-        moment=Moment(data.u_before[at], data.elapsed[at], data.left[at]),
+        phase=GaitPhase(data.u_before[at], data.elapsed[at], data.left[at]),
         mode=data.mode[at],
         new=data.new[at],
         ground=data.ground[first],
@@ -131,7 +131,7 @@ def predict(
     if W is None:
         W, features = np.zeros((len(Mode), STATE_DIM, 17)), affine
     step = _step(features, dt)
-    numbers = (body, jnp.asarray(W), jnp.zeros((len(Mode), 5, 2)) if landing is None else landing.W)
+    params = (body, jnp.asarray(W), jnp.zeros((len(Mode), 5, 2)) if landing is None else landing.W)
     states = np.repeat(data.x[:, :1], data.u.shape[1] + 1, axis=1)
     for first in range(0, len(states), _BLOCK):
         rows = np.arange(first, first + _BLOCK) % len(states)  # filled up: one compilation
@@ -141,9 +141,9 @@ def predict(
             # The feet at the start are seen, even where they have just come down.
             new = data.new[rows, i] & (i > 0) & (landing is not None)
             mode = data.mode[rows, i if landing is not None else 0]
-            moment = jax.tree.map(lambda a, i=i, rows=rows: a[rows, i], data.moment)
+            phase = jax.tree.map(lambda a, i=i, rows=rows: a[rows, i], data.phase)
             x, ground = step(
-                *numbers, x, ground, data.u[rows, i], mode, new, moment, data.level[rows]
+                *params, x, ground, data.u[rows, i], mode, new, phase, data.level[rows]
             )
             states[first : first + count, i + 1] = np.asarray(x)[:count]
     return states
@@ -165,11 +165,11 @@ def _step(features: Features, dt: float) -> Callable[..., tuple[Array, Array]]:
         u: Array,
         mode: Array,
         new: Array,
-        moment: Moment,
+        phase: GaitPhase,
         level: Array,
     ) -> tuple[Array, Array]:
         ground = jnp.where(new, _come_down(landing, mode, x, ground, level), ground)
-        gain = W[mode] @ read(features, x, u, ground, mode, moment)
+        gain = W[mode] @ read(features, x, u, ground, mode, phase)
         return planted(body, mode, ground, x, u, dt) + gain, ground
 
     return jax.jit(jax.vmap(step, in_axes=(None, None, None, *([0] * 7))))
@@ -178,7 +178,7 @@ def _step(features: Features, dt: float) -> Callable[..., tuple[Array, Array]]:
 def predict_as_lmpc(
     data: Windows,
     family: Family,
-    numbers: Any,
+    params: Any,
     force: Float[Array, "modes 4"],
     *,
     steps: int,
@@ -189,22 +189,22 @@ def predict_as_lmpc(
     Args:
       data: windows.
       family: of the model.
-      numbers: of every contact mode.
+      params: of every contact mode.
       force: about which it is linearised, body frame [N].
       steps: of the model in a control tick.
       feet: nominal contact points of every mode; those seen at the start if ``None`` [m].
     """
 
-    def one(x: Array, ground: Array, u: Array, mode: Array, moment: Moment) -> Array:
-        here = jax.tree.map(lambda a: a[mode], numbers)
+    def one(x: Array, ground: Array, u: Array, mode: Array, phase: GaitPhase) -> Array:
+        here = jax.tree.map(lambda a: a[mode], params)
         start = start_at(x, ground)
-        u_before, elapsed, left = (jnp.asarray(a) for a in moment)
+        u_before, elapsed, left = (jnp.asarray(a) for a in phase)
         rate = jnp.pi / (elapsed + left)
         start = start._replace(
             feet=start.feet if feet is None else feet[mode],
             u_before=u_before,
-            turn=rate * elapsed,
-            turn_rate=rate,
+            stance_phase=rate * elapsed,
+            stance_phase_rate=rate,
         )
         model = operating_point(family, here, start, force[mode], steps)
         return rollout(model, family.lift(here, start), u, start.feet)
@@ -213,8 +213,8 @@ def predict_as_lmpc(
     states = np.repeat(data.x[:, :1], data.u.shape[1] + 1, axis=1)
     for first in range(0, len(states), _BLOCK):
         rows = np.arange(first, first + _BLOCK) % len(states)
-        moment = jax.tree.map(lambda a, rows=rows: jnp.asarray(a[rows, 0]), data.moment)
-        values = run(data.x[rows, 0], data.ground[rows], data.u[rows], data.mode[rows, 0], moment)
+        phase = jax.tree.map(lambda a, rows=rows: jnp.asarray(a[rows, 0]), data.phase)
+        values = run(data.x[rows, 0], data.ground[rows], data.u[rows], data.mode[rows, 0], phase)
         count = min(_BLOCK, len(states) - first)
         states[first : first + count] = np.asarray(values)[:count]
     return states
@@ -249,7 +249,7 @@ def rms_ratio(
       nominal: squared, of what it is compared with.
       episode: (V,) number of each row's episode.
       draws: of the bootstrap.
-      seed: of its random numbers.
+      seed: of its random parameters.
 
     Returns:
       (3, H): ratio, lower and upper end.

@@ -4,7 +4,7 @@ A closed-loop episode, its forces perturbed so that they are not only feedback (
 becomes transitions of one control tick, each in the contact mode that the gait asks for. What is
 left of them by the planted rigid body,
 
-    x+ - planted(x, u) = W[mode] phi(x, u, contact points, place in the gait),
+    x+ - planted(x, u) = W[mode] phi(x, u, contact points, gait phase),
 
 is fitted per contact mode: masses of legs that move within the body, joint friction and armature,
 contacts that give way. Only rows in which exactly the scheduled feet touch the ground, and none of
@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from kjax.dynamics import srb_planar
 from kjax.koopman import regression
 from kjax.prediction.families import Start
-from kjax.prediction.features import Features, Moment, affine
+from kjax.prediction.features import Features, GaitPhase, affine
 from kjax.sysid.transitions import Transitions
 from kjax.types import MODE_ALPHA, STATE_DIM, Mode
 
@@ -100,7 +100,7 @@ def fit(
         Z, Y = (_summed(a, here, data, steps) for a in (phi, residual))
         if len(Z) < least:
             continue
-        solved = _solve(_triangle(Z, Y), size, ridge=ridge)
+        solved = _solve(_qr_factor(Z, Y), size, ridge=ridge)
         W, rank = np.asarray(solved.W), int(solved.rank)
         out.W[mode], out.rows[mode], out.rank[mode] = W.T, len(Z), rank
         out.columns[mode] = Z.any(axis=0).sum()
@@ -124,8 +124,8 @@ def force_gains(
     0.92; feedback in the data shows as less. NaN for modes without a fit.
     """
 
-    def next_state(u: Array, W: Array, x: Array, ground: Array, mode: Array, moment: Any) -> Array:
-        phi = read(features, x, u, ground, mode, moment._replace(u_before=u))
+    def next_state(u: Array, W: Array, x: Array, ground: Array, mode: Array, phase: Any) -> Array:
+        phi = read(features, x, u, ground, mode, phase._replace(u_before=u))
         return planted(body, mode, ground, x, u, dt) + W @ phi
 
     slope = jax.jit(jax.jacfwd(next_state))
@@ -134,9 +134,9 @@ def force_gains(
         here = data.planted & (data.mode == mode)
         x, u, ground = (a[here].mean(axis=0) for a in (data.x, data.u, data.ground))
         x[0], ground[:, 0] = 0.0, (data.ground[here, :, 0] - data.x[here, :1]).mean(axis=0)
-        moment = Moment(u, data.elapsed[here].mean(), data.left[here].mean())
+        phase = GaitPhase(u, data.elapsed[here].mean(), data.left[here].mean())
         with_fit, without = (
-            np.asarray(slope(u, W, x, ground, int(mode), moment))[3:5].reshape(2, 2, 2).sum(axis=1)
+            np.asarray(slope(u, W, x, ground, int(mode), phase))[3:5].reshape(2, 2, 2).sum(axis=1)
             for W in (fit.W[mode], np.zeros_like(fit.W[mode]))
         )
         out[mode] = np.diag(with_fit) / np.diag(without)
@@ -149,7 +149,7 @@ def read(
     u: Float[Array, "4"],
     ground: Float[Array, "2 2"],
     mode: Int[Array, ""],
-    moment: Moment,
+    phase: GaitPhase,
 ) -> Float[Array, "F"]:
     """Features without what belongs to an end that does not stand.
 
@@ -159,18 +159,18 @@ def read(
     stands = jnp.asarray(MODE_ALPHA)[mode] > 0
     ground = jnp.where(stands[:, None], ground, x[:2])
     pressed = jnp.repeat(stands, 2)
-    moment = moment._replace(u_before=jnp.where(pressed, moment.u_before, 0.0))
-    return features(start_at(x, ground), x, jnp.where(pressed, u, 0.0), moment)
+    phase = phase._replace(u_before=jnp.where(pressed, phase.u_before, 0.0))
+    return features(start_at(x, ground), x, jnp.where(pressed, u, 0.0), phase)
 
 
-def _triangle(Z: Float[np.ndarray, "K c"], Y: Float[np.ndarray, "K t"]) -> regression.Triangle:
-    """Triangle of the rows, in blocks of one size so that it compiles once."""
-    triangle = regression.empty(Z.shape[1], Y.shape[1], jnp.asarray(Z).dtype)
+def _qr_factor(Z: Float[np.ndarray, "K c"], Y: Float[np.ndarray, "K t"]) -> regression.QrFactor:
+    """QR factor of the rows, in blocks of one size so that it compiles once."""
+    factor = regression.empty(Z.shape[1], Y.shape[1], jnp.asarray(Z).dtype)
     for first in range(0, len(Z), _BLOCK):
         parts = [a[first : first + _BLOCK] for a in (Z, Y)]
         fill = ((0, _BLOCK - len(parts[0])), (0, 0))  # rows of zeros change nothing
-        triangle = _accumulate(triangle, *(np.pad(part, fill) for part in parts))
-    return triangle._replace(rows=jnp.asarray(len(Z), triangle.R.dtype))
+        factor = _accumulate(factor, *(np.pad(part, fill) for part in parts))
+    return factor._replace(rows=jnp.asarray(len(Z), factor.R.dtype))
 
 
 _BLOCK = 4096  # rows
@@ -182,19 +182,24 @@ def _rows(
     data: Transitions, body: srb_planar.SrbParams, dt: float, features: Features
 ) -> tuple[np.ndarray, np.ndarray]:
     """Features (M, F) and one-step residuals (M, 6) of the planted body."""
-    moment = Moment(data.u_before, data.elapsed, data.left)
-    phi, nominal = _reader(features, dt)(body, data.x, data.u, data.ground, data.mode, moment)
+    phase = GaitPhase(data.u_before, data.elapsed, data.left)
+    phi, nominal = _reader(features, dt)(body, data.x, data.u, data.ground, data.mode, phase)
     return np.asarray(phi), data.x_next - np.asarray(nominal)
 
 
 @lru_cache(maxsize=64)
 def _reader(features: Features, dt: float) -> Callable[..., tuple[Array, Array]]:
-    """Compiled (body, x, u, ground, mode, moment) -> features and nominal next states of rows."""
+    """Compiled (body, x, u, ground, mode, phase) -> features and nominal next states of rows."""
 
     def one(
-        body: srb_planar.SrbParams, x: Array, u: Array, ground: Array, mode: Array, moment: Moment
+        body: srb_planar.SrbParams,
+        x: Array,
+        u: Array,
+        ground: Array,
+        mode: Array,
+        phase: GaitPhase,
     ) -> tuple[Array, Array]:
-        phi = read(features, x, u, ground, mode, moment)
+        phi = read(features, x, u, ground, mode, phase)
         return phi, planted(body, mode, ground, x, u, dt)
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0, 0, 0)))

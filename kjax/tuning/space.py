@@ -102,20 +102,20 @@ def build_space(
         }
 
     def params(variables: Variables) -> ControllerParams:
-        numbers = values(variables)
+        values_by_key = values(variables)
         own = fits
-        if own.prediction is not None and isinstance(own.prediction.numbers, BodyModel):
-            body = own.prediction.numbers.body
+        if own.prediction is not None and isinstance(own.prediction.params, BodyModel):
+            body = own.prediction.params.body
             body = body._replace(
                 **{
                     key.removeprefix("srb."): jnp.broadcast_to(number, body.mass.shape)
-                    for key, number in numbers.items()
+                    for key, number in values_by_key.items()
                     if key.startswith("srb.")
                 }
             )
-            model = own.prediction.numbers._replace(body=body)
-            own = own._replace(prediction=own.prediction._replace(numbers=model))
-        return cast(gather(Overlay(config, numbers), robot, own), dtype)
+            model = own.prediction.params._replace(body=body)
+            own = own._replace(prediction=own.prediction._replace(params=model))
+        return cast(gather(Overlay(config, values_by_key), robot, own), dtype)
 
     def overrides(variables: Variables) -> dict[str, Any]:
         return {key: np.asarray(one, float).tolist() for key, one in values(variables).items()}

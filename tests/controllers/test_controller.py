@@ -342,7 +342,7 @@ def test_a_bound_s_reference_is_the_body_s_own_motion_at_the_clock_s_place(
         at = np.linspace(0.0, end - begin, table.shape[1])
         rows += [[np.interp(t + 0.001, at, column) for column in table[phase].T] for t in inside]
     expected = np.tile(rows, (2, 1))
-    # One model step ahead; the clock's place in the phase is rounded, rates of up to 100/s^2.
+    # One model step ahead; the clock's time in the phase is rounded, rates of up to 100/s^2.
     np.testing.assert_allclose(infos.reference[:, 1], HEIGHT + expected[:, 0], rtol=0, atol=1e-10)
     np.testing.assert_allclose(infos.reference[:, 2], expected[:, 1], rtol=0, atol=1e-10)
     np.testing.assert_allclose(infos.reference[:, 4:], expected[:, 2:], rtol=0, atol=1e-10)
@@ -630,20 +630,20 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
     feet[..., 1] -= go1.FOOT_RADIUS
     ends = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
     family = build.build_family(build.model_spec(config.koopman))
-    numbers, force, _ = jax.tree.map(lambda a: a[0], tables.params.fits.prediction)
+    model_params, force, _ = jax.tree.map(lambda a: a[0], tables.params.fits.prediction)
 
     def forces(u_before, elapsed):
         start = families.Start(
             view.planar.x.at[0].set(0.0), jnp.asarray(ends) @ view.planar.rotation, u_before,
             jnp.pi * elapsed / stance_time, jnp.pi / stance_time,
         )  # fmt: skip
-        model = families.operating_point(family, numbers, start, force, 4)
+        model = families.operating_point(family, model_params, start, force, 4)
         ahead = config.lmpc.model_dt * jnp.arange(1, 6)
         reference = reference_trajectory(
             position=state.lag, velocity=state.velocity, height=tables.params.height[0],
             periodic=jnp.zeros((5, 4)), ahead=ahead,
         )  # fmt: skip
-        z = family.lift(numbers, start)
+        z = family.lift(model_params, start)
         memory = last.memory
         solved = solve_lmpc(
             tables.lmpc,

@@ -116,14 +116,14 @@ def test_a_hundred_fits_in_one_call_are_single_fits_in_their_dictionaries(benchm
 
 
 def test_a_stream_ends_in_the_coefficients_of_one_factorisation(streaming, data):
-    triangle, sets = streaming.empty_triangle(), []
+    factor, sets = streaming.empty_factor(), []
     for i in range(3):
         sets.append(jax.tree.map(lambda leaf: leaf[i], data))
-        triangle = streaming.push(triangle, sets[-1])
-    assert triangle.rows == 3 * 700  # the rest of 200 behind each block of 500 is in it
+        factor = streaming.push(factor, sets[-1])
+    assert factor.rows == 3 * 700  # the rest of 200 behind each block of 500 is in it
     # Rounding of some hundred rows times the condition of the columns.
-    assert streaming.difference_from_one_shot(triangle, sets) < 1e-10
-    assert streaming.difference_from_one_shot(triangle, sets[:2]) > 1e-6
+    assert streaming.difference_from_one_shot(factor, sets) < 1e-10
+    assert streaming.difference_from_one_shot(factor, sets[:2]) > 1e-6
 
 
 def test_the_stream_counts_its_snapshots(streaming, small):

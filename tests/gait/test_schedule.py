@@ -245,9 +245,9 @@ def test_gaits_in_a_batch_are_an_index_and_trace_once(dtype):
 
     clock = begin(0, 0.005, dtype)
     for index in range(3):
-        moved = advance(clock._replace(gait=np.asarray(index)))
-        chex.assert_trees_all_equal_shapes_and_dtypes(moved, clock)
-        assert moved.gait == index
+        next_clock = advance(clock._replace(gait=np.asarray(index)))
+        chex.assert_trees_all_equal_shapes_and_dtypes(next_clock, clock)
+        assert next_clock.gait == index
 
 
 # The ramp of the flights. Phases that are no multiples of the tick and a ramp of 7 ms a cycle.
@@ -521,8 +521,8 @@ def test_switches_of_any_kind_trace_once_and_keep_the_clock_s_types(dtype):
         for now in (TROT, BOUNDING, LANDING):
             for wanted in (TROT, BOUNDING):
                 clock = begin(now, 0.005, dtype)
-                moved = tick(schedule, clock, np.asarray(wanted))
-                chex.assert_trees_all_equal_shapes_and_dtypes(moved, clock)
+                next_clock = tick(schedule, clock, np.asarray(wanted))
+                chex.assert_trees_all_equal_shapes_and_dtypes(next_clock, clock)
 
 
 @pytest.mark.parametrize(

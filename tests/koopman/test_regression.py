@@ -1,4 +1,4 @@
-"""The triangle of least squares against numpy.linalg.lstsq, however the rows come in."""
+"""The QR factor of least squares against numpy.linalg.lstsq, however the rows come in."""
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,8 @@ def lstsq(Z, Y):
     return np.linalg.lstsq(Z / scale, Y, rcond=None)[0] / scale[:, None]
 
 
-def solve(triangle, **options):
-    return jax.jit(lambda t: regression.solve(t, C, **options))(triangle)
+def solve(factor, **options):
+    return jax.jit(lambda t: regression.solve(t, C, **options))(factor)
 
 
 def test_all_rows_at_once(rows):
@@ -32,10 +32,10 @@ def test_all_rows_at_once(rows):
     # Rounding of targets of 1e3, seen through a column of 1e-3.
     np.testing.assert_allclose(weights.W, lstsq(*rows), rtol=1e-8)
     assert weights.rank == C
-    triangle = regression.of_rows(*rows)
+    factor = regression.of_rows(*rows)
     wanted = np.sqrt(np.mean((rows[1] - rows[0] @ np.asarray(weights.W)) ** 2, axis=0))
     # The residual, 0.1, is what is left of targets of 1e3: rounding of these.
-    np.testing.assert_allclose(regression.rms(triangle, weights.W), wanted, rtol=1e-9)
+    np.testing.assert_allclose(regression.rms(factor, weights.W), wanted, rtol=1e-9)
 
 
 def test_rows_in_blocks_or_from_two_machines_or_one_by_one(rows):
@@ -48,24 +48,24 @@ def test_rows_in_blocks_or_from_two_machines_or_one_by_one(rows):
     single = regression.block_rows(
         regression.empty(C, T), jnp.asarray(Z[:, None]), jnp.asarray(Y[:, None])
     )
-    for triangle in (blocks, merged, single):
-        assert triangle.rows == 400
-        np.testing.assert_allclose(solve(triangle).W, wanted, rtol=1e-9)
+    for factor in (blocks, merged, single):
+        assert factor.rows == 400
+        np.testing.assert_allclose(solve(factor).W, wanted, rtol=1e-9)
 
 
 def test_forgetting_follows_a_change(rows):
     """Recursive least squares: row i weighs forget^(age)."""
     Z, Y = rows
     forget = 0.95
-    triangle = regression.empty(C, T)
+    factor = regression.empty(C, T)
     step = jax.jit(lambda t, z, y: regression.accumulate(t, z[None], y[None], forget=forget))
     for z, y in zip(Z[:120], Y[:120], strict=True):
-        triangle = step(triangle, z, y)
+        factor = step(factor, z, y)
     weight = np.sqrt(forget ** np.arange(119, -1, -1))[:, None]
     np.testing.assert_allclose(
-        solve(triangle).W, lstsq(weight * Z[:120], weight * Y[:120]), rtol=1e-8
+        solve(factor).W, lstsq(weight * Z[:120], weight * Y[:120]), rtol=1e-8
     )
-    np.testing.assert_allclose(triangle.rows, (1 - forget**120) / (1 - forget), rtol=1e-12)
+    np.testing.assert_allclose(factor.rows, (1 - forget**120) / (1 - forget), rtol=1e-12)
 
 
 def test_a_cut_of_the_columns_is_the_smaller_problem(rows):

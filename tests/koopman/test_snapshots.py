@@ -24,9 +24,9 @@ def motion(rollouts=12, steps=40, seed=0, noise=0.0, dt=DT):
     a = rng.normal(size=(rollouts, steps, 3)) * [5.0, 8.0, 20.0]
     v0 = rng.normal(size=(rollouts, 1, 3)) * [0.5, 0.2, 1.0]
     v = np.concatenate([v0, v0 + dt * np.cumsum(a, axis=1)], axis=1)
-    moved = dt * v[:, :-1] + 0.5 * dt**2 * a
+    displacement = dt * v[:, :-1] + 0.5 * dt**2 * a
     x0 = rng.normal(size=(rollouts, 1, 3)) * [0.5, 0.05, 0.1] + [0.0, 0.3, 0.0]
-    x = np.concatenate([x0, x0 + np.cumsum(moved, axis=1)], axis=1)
+    x = np.concatenate([x0, x0 + np.cumsum(displacement, axis=1)], axis=1)
     states = np.concatenate([x, v + noise * rng.normal(size=v.shape)], axis=2)
     inputs = rng.normal(size=(rollouts, steps, 4)) * 50.0
     return Snapshots(states, inputs, np.zeros((rollouts, 2, 2)))
@@ -153,11 +153,13 @@ def test_samples_that_are_no_real_numbers_are_refused(field, kind):
 
 
 def test_observables_that_are_not_finite_are_refused_by_name():
-    mine = observables.own(lambda x: jnp.stack([jnp.sqrt(x[3]), x[5] ** 2]), names=["root", "sq"])
+    mine = observables.custom_dictionary(
+        lambda x: jnp.stack([jnp.sqrt(x[3]), x[5] ** 2]), names=["root", "sq"]
+    )
     text = refusal(motion(), mine)
     assert "observable 'root' is not finite" in text
     assert "rollout" in text
-    late = observables.own(lambda x: jnp.log(jnp.abs(x[:1] - 0.25)), names=["log"])
+    late = observables.custom_dictionary(lambda x: jnp.log(jnp.abs(x[:1] - 0.25)), names=["log"])
     states = motion().states.copy()
     states[7, 0, 0] = 0.25
     data = motion()._replace(states=states)

@@ -71,8 +71,8 @@ def nodes_at(params, schedule, phase, elapsed, cycle=10):
 
 
 @pytest.fixture(scope="module")
-def outlook_of(params):
-    """Outlook for given nodes, state and command, on flat ground."""
+def forecast_of(params):
+    """Forecast for given nodes, state and command, on flat ground."""
 
     def build(nodes, x, velocity=0.0, command=0.0, slew=2.0, contact=((0.05, 0.0), (-0.1, 0.0))):
         return multiphase.predict(
@@ -141,14 +141,14 @@ def test_nodes_tile_the_cycle_and_never_cross_a_phase(params, schedule, phase, e
 
 
 def test_the_predicted_motion_is_the_rigid_bodys_under_the_same_moments(
-    params, schedule, outlook_of
+    params, schedule, forecast_of
 ):
     # Independent integration of the body with forces in the world frame, the moment arm of each
-    # node taken from the outlook's path: the linear response must be exact.
+    # node taken from the forecast's path: the linear response must be exact.
     nodes = nodes_at(params, schedule, FRONT, 0.04)
     x = jnp.array([0.3, 0.26, 0.1, 0.5, -0.3, 1.2])
-    outlook = outlook_of(nodes, x, velocity=0.4, contact=((0.36, 0.0), (0.2, 0.01)))
-    free, forced = multiphase.response(params, nodes, outlook, x)
+    forecast = forecast_of(nodes, x, velocity=0.4, contact=((0.36, 0.0), (0.2, 0.01)))
+    free, forced = multiphase.response(params, nodes, forecast, x)
     force = np.random.default_rng(0).normal(size=(COUNT, 2)) * [40, 100]
     states = np.asarray(free + jnp.einsum("kajf,jf->ka", forced, jnp.asarray(force)))
 
@@ -156,7 +156,7 @@ def test_the_predicted_motion_is_the_rigid_bodys_under_the_same_moments(
     now = np.asarray(x)
     for k in np.flatnonzero(np.asarray(nodes.length) > 0):
         total = force[k] * float(nodes.feet[k])
-        r = np.asarray(outlook.foot[k] - outlook.path[k, :2])
+        r = np.asarray(forecast.foot[k] - forecast.path[k, :2])
         alpha = (r[0] * total[1] - r[1] * total[0]) / inertia
         a = np.r_[total / m - [0, GRAVITY], alpha]
         solved = solve_ivp(
@@ -167,27 +167,27 @@ def test_the_predicted_motion_is_the_rigid_bodys_under_the_same_moments(
 
 
 @pytest.mark.parametrize("slew", [2.0, np.inf])
-def test_the_reference_follows_the_command_at_its_slew(params, schedule, outlook_of, slew):
+def test_the_reference_follows_the_command_at_its_slew(params, schedule, forecast_of, slew):
     nodes = nodes_at(params, schedule, FRONT, 0.0)
     x = jnp.array([0.0, 0.27, 0.0, 0.1, 0.0, 0.0])
-    outlook = outlook_of(nodes, x, velocity=0.1, command=0.5, slew=slew)
+    forecast = forecast_of(nodes, x, velocity=0.1, command=0.5, slew=slew)
     t = np.asarray(nodes.end)
     wanted = np.minimum(0.1 + slew * t, 0.5)
-    np.testing.assert_allclose(outlook.reference[:, 3], wanted, atol=1e-12)
+    np.testing.assert_allclose(forecast.reference[:, 3], wanted, atol=1e-12)
     # Its position is the integral of its velocity.
     fine = np.linspace(0, t[-1], 20001)
     path = np.r_[0, np.cumsum(np.minimum(0.1 + slew * fine[1:], 0.5)) * (fine[1] - fine[0])]
-    np.testing.assert_allclose(outlook.reference[:, 0], np.interp(t, fine, path), atol=2e-5)
+    np.testing.assert_allclose(forecast.reference[:, 0], np.interp(t, fine, path), atol=2e-5)
 
 
 def test_feet_in_stance_are_where_they_were_measured_and_coming_ones_at_raiberts(
-    params, schedule, outlook_of
+    params, schedule, forecast_of
 ):
     nodes = nodes_at(params, schedule, FRONT, 0.05)
     x = jnp.array([1.0, 0.27, 0.0, 0.6, 0.0, 0.0])
     contact = ((1.07, 0.02), (0.9, 0.0))
-    outlook = outlook_of(nodes, x, velocity=0.6, command=0.6, contact=contact)
-    foot, phase, present = (np.asarray(a) for a in (outlook.foot, nodes.phase, nodes.present))
+    forecast = forecast_of(nodes, x, velocity=0.6, command=0.6, contact=contact)
+    foot, phase, present = (np.asarray(a) for a in (forecast.foot, nodes.phase, nodes.present))
     np.testing.assert_allclose(foot[present], [contact[0]] * present.sum())
     # The rear touches down after 0.05 s of stance and 0.1 s of flight, 0.6 m/s all the while.
     rear = foot[phase == REAR]
@@ -197,18 +197,18 @@ def test_feet_in_stance_are_where_they_were_measured_and_coming_ones_at_raiberts
 
 
 @pytest.mark.parametrize("end", [0, 1])
-def test_torque_rows_are_c_mujocos_jacobian(params, schedule, outlook_of, planar_go1, end):
+def test_torque_rows_are_c_mujocos_jacobian(params, schedule, forecast_of, planar_go1, end):
     phase = REAR if end else FRONT
     nodes = nodes_at(params, schedule, phase, 0.0)
     x = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
-    outlook = outlook_of(nodes, x, contact=((0.15, 0.0), (-0.2, 0.0)))
+    forecast = forecast_of(nodes, x, contact=((0.15, 0.0), (-0.2, 0.0)))
     lever = jnp.array([0.01, -0.02])
-    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, outlook, lever)
+    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, forecast, lever)
     np.testing.assert_allclose(limit, [0, 0, 0.95 * 23.7, 0.95 * 35.55], rtol=1e-12)
 
     # Put MuJoCo's trunk where node 0 expects it and turn the joints until the foot is there.
     leg = Leg.RR if end else Leg.FR
-    px, pz, theta = np.asarray(outlook.path[0])
+    px, pz, theta = np.asarray(forecast.path[0])
     R = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
     data = mujoco.MjData(planar_go1)
     base = [px, pz] - R @ np.asarray(lever)
@@ -217,7 +217,7 @@ def test_torque_rows_are_c_mujocos_jacobian(params, schedule, outlook_of, planar
     dofs = [planar_go1.joint(f"{leg.name}_{name}").dofadr[0] for name in ("thigh", "calf")]
     data.qpos[joints] = 0.8, -1.6
     geom = planar_go1.geom(f"{leg.name}_foot").id
-    target = np.asarray(outlook.foot[0]) + np.array([0, go1.FOOT_RADIUS])
+    target = np.asarray(forecast.foot[0]) + np.array([0, go1.FOOT_RADIUS])
     jacobian = np.zeros((3, planar_go1.nv))
     for _ in range(60):
         mujoco.mj_kinematics(planar_go1, data)
@@ -232,21 +232,21 @@ def test_torque_rows_are_c_mujocos_jacobian(params, schedule, outlook_of, planar
 
 
 @pytest.fixture(scope="module")
-def plan(params, schedule, outlook_of):
+def plan(params, schedule, forecast_of):
     """A solved plan of a moving robot in front stance, with all that went in."""
     nodes = nodes_at(params, schedule, FRONT, 0.02)
     x = jnp.array([0.0, 0.262, -0.08, 0.3, -0.1, -0.3])
-    outlook = outlook_of(nodes, x, velocity=0.3, command=1.0)
+    forecast = forecast_of(nodes, x, velocity=0.3, command=1.0)
     lever = jnp.array([0.0, -0.018])
 
     @jax.jit
     def solve(params):
         return multiphase.solve(
-            params, go1.PARAMS, nodes, outlook, x, lever, tolerance=1e-9, max_iterations=40
+            params, go1.PARAMS, nodes, forecast, x, lever, tolerance=1e-9, max_iterations=40
         )
 
-    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, outlook, lever)
-    return solve, nodes, outlook, rows, limit
+    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, forecast, lever)
+    return solve, nodes, forecast, rows, limit
 
 
 def test_the_plan_keeps_to_friction_torque_and_box(params, plan):
@@ -292,7 +292,7 @@ def test_only_a_bound_with_that_horizon_has_nodes(config):
 
 @pytest.mark.parametrize("slew", [2.0, np.inf])
 def test_an_outlook_has_derivatives_where_the_reference_has_arrived(
-    params, schedule, outlook_of, slew
+    params, schedule, forecast_of, slew
 ):
     """Reverse mode by velocity and command, against differences; at the kink from one side."""
     nodes = nodes_at(params, schedule, FRONT, 0.03)
@@ -300,7 +300,7 @@ def test_an_outlook_has_derivatives_where_the_reference_has_arrived(
 
     @jax.jit
     def total(velocity, command):
-        out = outlook_of(nodes, x, velocity, command, slew)
+        out = forecast_of(nodes, x, velocity, command, slew)
         return jnp.sum(out.path) + 0.3 * jnp.sum(out.reference) + 0.7 * jnp.sum(out.foot)
 
     both = jax.jit(jax.grad(total, argnums=(0, 1)))

@@ -20,7 +20,7 @@ X0 = np.array([0.3, 0.27, 0.2, 0.4, -0.1, 0.8])
 
 
 @pytest.fixture(params=[Mode.TROT, Mode.FRONT, Mode.REAR, Mode.FLIGHT], ids=lambda m: m.name)
-def numbers(request, body):
+def params(request, body):
     return families.BodyModel(body, jnp.asarray(MODE_ALPHA[request.param], float))
 
 
@@ -34,10 +34,10 @@ def forces(steps, seed=0):
     return rng.uniform([-30, 20, -30, 20], [30, 110, 30, 110], (steps, 4))
 
 
-def integrated(numbers, feet, inputs, world):
+def integrated(params, feet, inputs, world):
     """The planted body in plain NumPy, by an adaptive integrator at tight tolerances."""
-    alpha, mass = np.asarray(numbers.alpha), float(numbers.body.mass)
-    inertia = float(numbers.body.inertia)
+    alpha, mass = np.asarray(params.alpha), float(params.body.mass)
+    inertia = float(params.body.inertia)
 
     def turn(angle):
         return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -59,28 +59,28 @@ def integrated(numbers, feet, inputs, world):
 
 
 @pytest.mark.parametrize("plant", ["planted", "space"])
-def test_planted_bodies_move_as_an_adaptive_integrator_says(numbers, start, plant):
+def test_planted_bodies_move_as_an_adaptive_integrator_says(params, start, plant):
     inputs = forces(20)
-    wanted = integrated(numbers, start.feet, inputs, world=plant == "space")
+    wanted = integrated(params, start.feet, inputs, world=plant == "space")
     run = jax.jit(srb_planar.trajectory, static_argnums=(0, 5))
-    got = run(plant, numbers.body, numbers.alpha, start.x, jnp.asarray(inputs), DT)
+    got = run(plant, params.body, params.alpha, start.x, jnp.asarray(inputs), DT)
     # Runge-Kutta at 1 ms: dt^5 / 120 times fifth derivatives of up to 1e5 (a force on one end turns
     # the body at 100 rad/s^2) over 20 steps; the reference is good to 1e-12.
     np.testing.assert_allclose(got, wanted, rtol=0, atol=2e-9)
 
 
-def test_the_exact_model_is_exact(numbers, start):
+def test_the_exact_model_is_exact(params, start):
     inputs = jnp.asarray(forces(500))
-    wanted = srb_planar.trajectory("space", numbers.body, numbers.alpha, start.x, inputs, DT)
-    got = families.rollout(families.exact(DT), numbers, start, inputs)
+    wanted = srb_planar.trajectory("space", params.body, params.alpha, start.x, inputs, DT)
+    got = families.rollout(families.exact(DT), params, start, inputs)
     # Runge-Kutta integrates these polynomials exactly: rounding over 500 steps is left.
     np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11)
 
 
-def test_one_exact_step_of_100_ms_equals_100_of_one(numbers, start):
+def test_one_exact_step_of_100_ms_equals_100_of_one(params, start):
     u = jnp.asarray(forces(1)[0])
-    long = families.rollout(families.exact(100 * DT), numbers, start, u[None])[-1]
-    short = families.rollout(families.exact(DT), numbers, start, jnp.tile(u, (100, 1)))[-1]
+    long = families.rollout(families.exact(100 * DT), params, start, u[None])[-1]
+    short = families.rollout(families.exact(DT), params, start, jnp.tile(u, (100, 1)))[-1]
     np.testing.assert_allclose(long, short, rtol=0, atol=1e-12)
 
 
@@ -156,8 +156,8 @@ NAMES = ("linear", "bilinear", "srb_hover", "srb", "planted", "exact", "residual
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_lifted_state_begins_with_one_and_the_state(every_family, start, name):
-    family, numbers = every_family[name]
-    z = family.lift(numbers, start)
+    family, params = every_family[name]
+    z = family.lift(params, start)
     assert z.shape == (family.size,)
     np.testing.assert_array_equal(z[:7], np.r_[1.0, X0])
     assert family.name == name
@@ -165,11 +165,11 @@ def test_a_lifted_state_begins_with_one_and_the_state(every_family, start, name)
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_operating_point_is_the_tangent(every_family, start, name):
-    family, numbers = every_family[name]
+    family, params = every_family[name]
     u = jnp.asarray(forces(1)[0])
-    z = family.lift(numbers, start)
-    step = jax.jit(lambda z, u: family.step(numbers, start, z, u))
-    here = jax.jit(lambda u: families.operating_point(family, numbers, start, u))(u)
+    z = family.lift(params, start)
+    step = jax.jit(lambda z, u: family.step(params, start, z, u))
+    here = jax.jit(lambda u: families.operating_point(family, params, start, u))(u)
     np.testing.assert_allclose(here.A @ z + here.B @ u, step(z, u), rtol=0, atol=1e-13)
     rng = np.random.default_rng(1)
     dz, du = rng.normal(size=z.shape), rng.normal(size=4)
@@ -182,11 +182,11 @@ def test_the_operating_point_is_the_tangent(every_family, start, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_many_steps_at_once_are_the_steps_one_after_another(every_family, start, name):
-    family, numbers = every_family[name]
+    family, params = every_family[name]
     u = jnp.asarray(forces(1)[0])
-    one = families.operating_point(family, numbers, start, u)
-    five = families.operating_point(family, numbers, start, u, steps=5)
-    z = family.lift(numbers, start)
+    one = families.operating_point(family, params, start, u)
+    five = families.operating_point(family, params, start, u, steps=5)
+    z = family.lift(params, start)
     wanted = z
     for _ in range(5):
         wanted = one.A @ wanted + one.B @ u

@@ -1,4 +1,4 @@
-"""Learned lifting, numbers on disk, dictionaries as data, and what a fit says to bad data."""
+"""Learned lifting, parameters on disk, dictionaries as data, and what a fit says to bad data."""
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ from kjax.config import KoopmanConfig, SrbConfig
 from kjax.controllers.rigid_body import own_body
 from kjax.koopman import edmd, observables
 from kjax.koopman.dataset import Snapshots
+from kjax.koopman.observables import custom_dictionary
 from kjax.prediction import build, families, learned, storage
 from kjax.robots import go1
 from kjax.types import Mode
@@ -109,7 +110,7 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     path = tmp_path / "model.npz"
     storage.save(path, storage.Stored("learned", 1e-3, model, spread))
     back = storage.load(path, "learned")
-    jax.tree.map(np.testing.assert_array_equal, back.numbers, model)
+    jax.tree.map(np.testing.assert_array_equal, back.params, model)
     config = KoopmanConfig(model="learned", file=str(path))
     assert build.build_family(build.model_spec(config)).size == 8
     body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
@@ -192,7 +193,7 @@ def test_fourier_features_approach_the_gaussian_kernel():
 
 
 def test_ones_own_observables_in_one_line():
-    dictionary = observables.own(lambda x: jnp.stack([jnp.sin(x[2]), x[5] * x[3]]))
+    dictionary = custom_dictionary(lambda x: jnp.stack([jnp.sin(x[2]), x[5] * x[3]]))
     z = dictionary.lift(jnp.asarray(X))
     np.testing.assert_allclose(z[7:], [np.sin(0.2), 0.75])
     assert dictionary.names[7:] == ("own 0", "own 1")
@@ -204,9 +205,15 @@ def test_ones_own_observables_in_one_line():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: observables.own(lambda x: x[2]), "function must return a vector"),
-        (lambda: observables.own(lambda x: x[:2] @ x), "does not take a state of shape"),
-        (lambda: observables.own(lambda x: x[:2], names=["a"]), "must have 2 entries each, got 1"),
+        (lambda: custom_dictionary(lambda x: x[2]), "function must return a vector"),
+        (
+            lambda: custom_dictionary(lambda x: x[:2] @ x),
+            "does not take a state of shape",
+        ),
+        (
+            lambda: custom_dictionary(lambda x: x[:2], names=["a"]),
+            "must have 2 entries each, got 1",
+        ),
         (lambda: observables.monomials(0), "degree must be 1 or more, got 0"),
         (lambda: observables.fourier(0), "count must be at least 1, got 0"),
         (lambda: observables.delays(observables.states_only(), 0), "count must be at least 1"),
@@ -268,7 +275,7 @@ def put(index, value):
     ("changes", "message"),
     [
         ({"states": put((3, 7, 2), np.nan)}, "states: 1 of 6 rollouts.*the first one is rollout 3"),
-        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold numbers that are not"),
+        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold parameters that are not"),
         ({"states": lambda a: a[..., :5]}, r"states: got shape \(6, 21, 5\), wanted"),
         ({"inputs": lambda a: a[:, :-1]}, r"inputs: got shape \(6, 19, 4\), wanted \(6, 20, 4\)"),
         ({"feet": lambda a: a[:1]}, r"feet: got shape \(1, 2, 2\), wanted \(6, 2, 2\)"),

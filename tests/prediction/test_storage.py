@@ -52,7 +52,7 @@ def refusal(path, family="residual"):
 def test_a_residual_comes_back_as_it_was_saved(tmp_path, features):
     storage.save(tmp_path / "model.npz", residual(features))
     back = storage.load(tmp_path / "model.npz", "residual")
-    np.testing.assert_array_equal(back.numbers, residual(features).numbers)
+    np.testing.assert_array_equal(back.params, residual(features).params)
     assert (back.dt, back.features) == (0.005, features)
 
 

@@ -95,15 +95,15 @@ def test_the_residual_vanishes_at_a_known_solution(random_qp, dtype):
 def test_the_residual_sees_every_way_of_missing_the_solution(random_qp):
     H, q, lower, upper, x = random_qp(0)
     free, at_lower, at_upper = 2, 0, 1
-    moved = x.copy()
-    moved[free] += 0.01
+    shifted = x.copy()
+    shifted[free] += 0.01
     inside_from_lower = x.copy()
     inside_from_lower[at_lower] += 0.01
     inside_from_upper = x.copy()
     inside_from_upper[at_upper] -= 0.01
     outside = x.copy()
     outside[at_lower] -= 0.01
-    for wrong in (moved, inside_from_lower, inside_from_upper, outside):
+    for wrong in (shifted, inside_from_lower, inside_from_upper, outside):
         # A miss of 0.01 in one coordinate moves its own scaled gradient by 0.01 |x_hat| / |q_hat|,
         # over a hundred times less than that is rounding.
         assert kkt_residual(*map(jnp.asarray, (H, q, lower, upper, wrong))) > 1e-5

@@ -56,7 +56,7 @@ VALUES = {
 # What a controller or a scene is compiled for.
 STATIC = {
     "robot",
-    "lmpc.control_dt", "lmpc.model_dt", "lmpc.horizon", "lmpc.caution", "lmpc.solver",
+    "lmpc.control_dt", "lmpc.model_dt", "lmpc.horizon", "lmpc.uncertainty_discount", "lmpc.solver",
     "lmpc.warm_start", "lmpc.tolerance", "lmpc.max_iterations", "leg.act_dt",
     "koopman.model", "koopman.dictionary", "koopman.order", "koopman.fourier_count",
     "koopman.fourier_scale", "koopman.fourier_seed", "koopman.constant_rotation", "koopman.feet",

@@ -59,14 +59,14 @@ def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
     """Same physics: a ball dropped on the moved field does what it does on the compiled one."""
     first = TerrainConfig(kind=kind, seed=1)
     second = TerrainConfig(kind=kind, seed=2)
-    moved = build_model(go1.ROBOT, SimConfig(), first)
-    terrain.place(moved, terrain.generate(second, 0.8))
+    placed = build_model(go1.ROBOT, SimConfig(), first)
+    terrain.place(placed, terrain.generate(second, 0.8))
     compiled = build_model(go1.ROBOT, SimConfig(), second)
     for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound"):
-        np.testing.assert_allclose(getattr(moved, name), getattr(compiled, name), atol=1e-12)
-    np.testing.assert_allclose(moved.geom_aabb, compiled.geom_aabb, atol=1e-12)
+        np.testing.assert_allclose(getattr(placed, name), getattr(compiled, name), atol=1e-12)
+    np.testing.assert_allclose(placed.geom_aabb, compiled.geom_aabb, atol=1e-12)
     states = []
-    for model in (moved, compiled):
+    for model in (placed, compiled):
         data = mujoco.MjData(model)
         height, joints = stand_pose(go1.PARAMS, 0.27)
         data.qpos[find_addresses(go1.ROBOT, model).qpos] = joints

@@ -32,12 +32,12 @@ def true_weights(rng):
 def stepper(body, W):
     """Compiled (x, u, ground) -> next state."""
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
-    numbers = families.ResidualModel(families.BodyModel(body, alpha), jnp.asarray(W[Mode.TROT]))
+    params = families.ResidualModel(families.BodyModel(body, alpha), jnp.asarray(W[Mode.TROT]))
     family = families.residual(DT, features.affine, remembers=False)
 
     def step(x, u, ground):
         start = whole_body.start_at(x, ground)
-        return family.step(numbers, start, family.lift(numbers, start), u)[1:]
+        return family.step(params, start, family.lift(params, start), u)[1:]
 
     return jax.jit(step)
 
@@ -53,11 +53,11 @@ def walk(seed, body, W, *, phases=4, lost=()):
     force = np.zeros((ticks, 4, 3))
     step = stepper(body, W)
     for t in range(ticks):
-        moved = t % PHASE == 0
+        touches = t % PHASE == 0
         offset = np.array([0.19, 0.19, -0.18, -0.18]) + 0.05 * rng.normal(size=4)
         fresh = np.stack([x[t, 0] + offset, np.full(4, SOLE) + 0.01 * rng.normal(size=4)], axis=1)
-        feet[t] = np.where(stance[t, :, None] & (not moved), feet[t - 1], fresh)
-        if moved and t > 0:  # feet that lift do so after the sample that ends their last tick
+        feet[t] = np.where(stance[t, :, None] & (not touches), feet[t - 1], fresh)
+        if touches and t > 0:  # feet that lift do so after the sample that ends their last tick
             feet[t] = np.where(stance[t, :, None], fresh, feet[t - 1])
         ends = np.array([0.0, 62.0]) + 20.0 * rng.normal(size=(2, 2))
         c, s = np.cos(x[t, 2]), np.sin(x[t, 2])
@@ -112,11 +112,11 @@ def test_the_fit_is_what_the_residual_family_takes(data, body, weights):
     np.testing.assert_allclose(predicted, window.x, atol=1e-11)
     family = families.residual(DT, features.affine, remembers=False)
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
-    numbers = families.ResidualModel(
+    params = families.ResidualModel(
         families.BodyModel(body, alpha), jnp.asarray(weights[Mode.TROT])
     )
     start = whole_body.start_at(jnp.asarray(window.x[3, 0]), jnp.asarray(window.ground[3]))
-    states = families.rollout(family, numbers, start, jnp.asarray(window.u[3]))
+    states = families.rollout(family, params, start, jnp.asarray(window.u[3]))
     np.testing.assert_allclose(predicted[3], states, atol=1e-12)
 
 
@@ -129,24 +129,24 @@ def test_a_residual_that_remembers_is_the_same_prediction(data, body):
     W[..., 17:21] /= 100.0
     predicted = open_loop.predict(window, body, dt=DT, W=W, features=features.clock_history)
     family = families.residual(DT, features.clock_history)
-    numbers = families.ResidualModel(
+    params = families.ResidualModel(
         families.BodyModel(body, jnp.asarray(MODE_ALPHA[Mode.TROT], float)),
         jnp.asarray(W[Mode.TROT]),
     )
 
     @jax.jit
-    def rollout(x, ground, moment, u):
-        whole = moment.elapsed[0] + moment.left[0]
+    def rollout(x, ground, phase, u):
+        whole = phase.elapsed[0] + phase.left[0]
         start = whole_body.start_at(x, ground)._replace(
-            u_before=moment.u_before[0],
-            turn=jnp.pi * moment.elapsed[0] / whole,
-            turn_rate=jnp.pi / whole,
+            u_before=phase.u_before[0],
+            stance_phase=jnp.pi * phase.elapsed[0] / whole,
+            stance_phase_rate=jnp.pi / whole,
         )
-        return families.rollout(family, numbers, start, u)
+        return families.rollout(family, params, start, u)
 
     for i in (0, 1, 5):
-        moment = jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), window.moment)
-        own = rollout(window.x[i, 0], window.ground[i], moment, window.u[i])
+        phase = jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), window.phase)
+        own = rollout(window.x[i, 0], window.ground[i], phase, window.u[i])
         np.testing.assert_allclose(own, predicted[i], atol=1e-12)
         assert np.abs(predicted[i] - window.x[i]).max() > 1e-4  # the weights count
 
@@ -200,7 +200,7 @@ def test_lost_early_and_slipping_contacts_are_marked(body, weights):
     assert not seen.planted[[4, 5, 19, 20, 28, 30]].any()
     inside = open_loop.windows(seen, 3, inside=True)
     assert inside.disturbed.sum() == 3  # they are kept, and told
-    begins = np.round(inside.moment.elapsed[:, 0] / DT).astype(int)
+    begins = np.round(inside.phase.elapsed[:, 0] / DT).astype(int)
     assert begins[:5].tolist() == [0, 1, 6, 7, 1]  # of the first phase 0-3 and 6-9, then 13 on
 
 
@@ -317,10 +317,10 @@ def test_the_experiment_runs_and_records_once(repository, tmp_path, monkeypatch,
     trot, bound = (
         storage.load(tmp_path / f"residual_{gait}.npz", "residual") for gait in ("trot", "bound")
     )
-    assert trot.numbers.shape == (len(Mode), 6, 17)
-    assert trot.numbers[Mode.TROT].any()
-    assert not trot.numbers[Mode.REAR].any()
-    assert bound.numbers[Mode.FRONT].any()
+    assert trot.params.shape == (len(Mode), 6, 17)
+    assert trot.params[Mode.TROT].any()
+    assert not trot.params[Mode.REAR].any()
+    assert bound.params[Mode.FRONT].any()
     # One tick's error of the velocity after 5 ms: millimetres per second.
     assert (trot.spread[Mode.TROT, 3:5] > 1e-4).all()
     assert (trot.spread[Mode.TROT, 3:5] < 2e-2).all()

@@ -103,10 +103,10 @@ def test_the_scheduled_feet_carry_and_stay_where_they_are(space, run, scenarios)
     assert trace.x.shape == (COUNT, 100, 6)
     force, stance = np.asarray(trace.force), np.asarray(trace.stance)
     assert (force[~stance] == 0.0).all()
-    moved = np.diff(np.asarray(trace.feet), axis=1)
-    assert (moved[stance[:, 1:] & stance[:, :-1]] == 0.0).all()
+    displacement = np.diff(np.asarray(trace.feet), axis=1)
+    assert (displacement[stance[:, 1:] & stance[:, :-1]] == 0.0).all()
     landed = stance[:, 1:] & ~stance[:, :-1]
-    assert (np.abs(moved[landed][:, 0]) > 1e-4).any()
+    assert (np.abs(displacement[landed][:, 0]) > 1e-4).any()
     assert (np.asarray(trace.status) == 0).all()
 
 

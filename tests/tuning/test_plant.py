@@ -33,9 +33,9 @@ def test_on_its_legs_the_body_moves_as_newton_and_euler_say():
         return [*x[3:], total[0] / 12.7, total[1] / 12.7 - 9.81, moment / 0.39]
 
     wanted = solve_ivp(rate, (0, 0.001), X, "DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
-    moved = plant.advance(PLANT, stance, X, FEET, force, 0.001)
+    next_state = plant.advance(PLANT, stance, X, FEET, force, 0.001)
     # One Runge-Kutta step: 1.4e-8 at 5 ms, of fifth order.
-    np.testing.assert_allclose(moved, wanted, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(next_state, wanted, rtol=0, atol=1e-11)
 
 
 def test_the_view_puts_trunk_and_feet_where_the_body_says():

@@ -64,9 +64,9 @@ def test_a_tuned_config_holds_the_new_values_and_no_others():
 
 def test_a_step_of_a_tenth_is_ten_per_cent_of_a_weight():
     space = build_space(BOUND, ["gaits.bound.Q"])
-    moved = {key: one + 0.1 for key, one in space.start.items()}
+    shifted = {key: one + 0.1 for key, one in space.start.items()}
     own = BOUND.gaits.bound.Q
-    ratio = np.array(space.overrides(moved)["gaits.bound.Q"]) / own
+    ratio = np.array(space.overrides(shifted)["gaits.bound.Q"]) / own
     np.testing.assert_allclose(ratio, np.exp(0.1), rtol=1e-12)
 
 

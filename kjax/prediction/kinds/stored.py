@@ -30,12 +30,12 @@ def _residual(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
 
 def _of_modes(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
     stored, chosen = _stored(config), np.array(bodies.modes)
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[chosen], stored.numbers)
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[chosen], stored.params)
     return own, jnp.asarray(stored.spread)[chosen]
 
 
 def _lifted(config: KoopmanConfig, spec: ModelSpec) -> ModelSpec:
-    size = _stored(config).numbers.head.A.shape[-1]
+    size = _stored(config).params.head.A.shape[-1]
     return replace(spec, lifted=size - len(states_only().names))
 
 

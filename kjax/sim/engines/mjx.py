@@ -254,10 +254,10 @@ class MjxEngine:
         def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
             push = push_at(episode, step, xp=jnp).astype(self.dtype)
             pushes = jnp.zeros_like(data.xfrc_applied).at[trunk, :3].set(push)
-            moved = mjx.step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
+            stepped = mjx.step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
             # A robot that has fallen stays as it is, whatever its numbers have become.
             return jax.tree.map(
-                lambda new, old: jnp.where(alive, new, old), _same_types(moved, data), data
+                lambda new, old: jnp.where(alive, new, old), _same_types(stepped, data), data
             )
 
         def act(carry: MjxState, _: None) -> tuple[MjxState, Array]:

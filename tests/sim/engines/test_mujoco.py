@@ -51,8 +51,8 @@ def test_it_walks_as_high_above_its_gaits_height_as_it_is_asked_to(simulation, r
     config = load_config(RunConfig, None, SHORT | {"command.height": [0.0, height]})
     other = simulate(simulation, config, seed=0)
     np.testing.assert_array_equal(other.x[:500], run.x[:500])
-    moved = np.mean(other.x[-500:, 1] - run.x[-500:, 1])
-    assert moved == pytest.approx(height, abs=1e-3)
+    rise = np.mean(other.x[-500:, 1] - run.x[-500:, 1])
+    assert rise == pytest.approx(height, abs=1e-3)
     assert metrics(other, config)["pitch_max_deg"] < 3.0
 
 
