@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 import typing
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -24,6 +25,8 @@ import tomli_w
 
 from kjax.config import ConfigError, GaitConfig, RunConfig, fields, load_config, to_dict
 from kjax.config.gaits import LIBRARY
+from kjax.config.loading import what_became_of
+from kjax.robots import get_robot
 
 T = TypeVar("T")
 
@@ -160,6 +163,9 @@ def parse(
     args, unknown = parser.parse_known_args(_join_values(words))
     for word in unknown:
         name = word.split("=")[0]
+        became = what_became_of(name.removeprefix("--"))
+        if became:
+            fail(f"{name}: {became}")
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
         fail(f"unknown option {name}" + (f"; did you mean {near[0]}?" if near else ""))
     overrides = {
@@ -168,9 +174,22 @@ def parse(
         if key.startswith("key:") and text is not None
     }
     try:
-        return load_config(cls, args.config, overrides), args
-    except ConfigError as error:
+        config = load_config(cls, args.config, overrides)
+        if isinstance(config, RunConfig):
+            _require_walkable(config)
+    except ValueError as error:
         fail(str(error))
+    return config, args
+
+
+def _require_walkable(config: RunConfig) -> None:
+    """Raise a ValueError for a config that no controller can be made from, before it takes long."""
+    from kjax.controllers.walkable import check_walkable
+    from kjax.prediction.build import model_spec
+
+    model_spec(config.koopman)
+    with warnings.catch_warnings(action="ignore"):  # said again when the controller is made
+        check_walkable(config, get_robot(config.robot).params)
 
 
 def _join_values(words: Sequence[str]) -> list[str]:

@@ -135,3 +135,21 @@ def test_the_core_imports_neither_mujoco_nor_matplotlib():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--robot", "go2"], "robot: got 'go2', wanted one of go1"),
+        (["--robot", "no_module:ROBOT"], "robot: 'no_module:ROBOT' cannot be loaded"),
+        (["--koopman.model", "linar"], "koopman.model: got 'linar'"),
+        (["--koopman.model", "residual"], "koopman.file: model = 'residual' needs a file"),
+        (["--lmpc.grf_z_max", "0.1"], "lmpc.grf_z_max: in a cycle of trot"),
+        (["--gaits.trot.period", "0.008"], "gaits.trot: offset and duty"),
+        (["--lmpc.height", "0.3"], "--lmpc.height: is now lmpc.body_height, in units of L"),
+        (["--gaits.bound.apex", "0.1"], "--gaits.bound.apex: is now gaits.bound.swing_height"),
+        (["--lmpc.caution", "1.0"], "--lmpc.caution: is now lmpc.uncertainty_discount"),
+    ],
+)
+def test_what_cannot_walk_is_one_line_before_anything_is_compiled(capsys, words, text):
+    assert text in refusal(capsys, *words)

@@ -105,6 +105,14 @@ RETIRED = {
 }
 
 
+def what_became_of(key: str) -> str:
+    """What has become of a key of an earlier version; empty for a key that there never was."""
+    section, _, leaf = key.rpartition(".")
+    if section.startswith("gaits.") and leaf in _RESCALED_GAIT:
+        return _rescaled(GaitConfig, _RESCALED_GAIT[leaf], section)
+    return RETIRED.get(key, "")
+
+
 class ConfigError(ValueError):
     """A configuration that cannot be used; the message names file, key, value and wish."""
 
@@ -218,11 +226,9 @@ def _explain(error: ValidationError, cls: type) -> str:
     key = ".".join(loc)
     came = first["input"]
     if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        if key in RETIRED:
-            return f"{key}: {RETIRED[key]}"
-        if loc[0] == "gaits" and loc[-1] in _RESCALED_GAIT:
-            section = ".".join(loc[:-1])
-            return f"{key}: {_rescaled(GaitConfig, _RESCALED_GAIT[loc[-1]], section)}"
+        became = what_became_of(key)
+        if became:
+            return f"{key}: {became}"
         inner = [old for old in RETIRED if old.startswith(f"{key}.")]
         if inner and isinstance(came, Mapping):  # a section that has gone
             old = next((o for o in inner if o.split(".", 1)[1] in came), inner[0])

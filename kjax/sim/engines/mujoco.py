@@ -90,7 +90,12 @@ class MujocoEngine:
                 if on_progress is not None:
                     on_progress(before + done, sum(steps))
 
-            parts.append(self._episode(config, on_tick))
+            try:
+                parts.append(self._episode(config, on_tick))
+            except KeyboardInterrupt:  # before there was anything of this one to keep
+                if not parts:
+                    raise
+                parts[-1] = dataclasses.replace(parts[-1], interrupted=True)
             if parts[-1].interrupted:
                 break
         return side_by_side(parts)
