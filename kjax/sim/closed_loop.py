@@ -21,7 +21,7 @@ from kjax.legs.base import build_base
 from kjax.robots import Robot
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT
 from kjax.sim.excitation import perturb
-from kjax.sim.noise import FORCES, SENSORS, add_noise, noise_dim, normal_row
+from kjax.sim.noise import FORCES, SENSORS, add_noise, noise_dim, normal
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.resolve import BatchSpec, EpisodeParams, SceneSpec
 from kjax.types import Observation, RobotParams
@@ -133,7 +133,7 @@ def build_closed_loop(
     def sense(noise: Noise, sensed: Sensed) -> Observation:
         if not scene.noise:
             return see(sensed)
-        # Else XLA reads the numbers again for each of their uses.
+        # Else XLA draws the numbers again for each of their uses.
         seen = add_noise(see(sensed), noise.sensors.astype(sensed.qpos.dtype))
         return jax.lax.optimization_barrier(seen)
 
@@ -187,10 +187,10 @@ def draw_noise(scene: SceneSpec, episode: EpisodeParams, step: Array) -> Noise:
     """Noise of a physics step of an episode, float32."""
     sensors = force = jnp.zeros(0, jnp.float32)
     if scene.noise:
-        row = normal_row(episode.seed, step, SENSORS, noise_dim(scene.base))
+        row = normal(episode.seed, step, SENSORS, noise_dim(scene.base))
         sensors = row * episode.noise_scale
     if scene.force_noise:
-        force = episode.force_noise * normal_row(episode.seed, step, FORCES, 4)
+        force = episode.force_noise * normal(episode.seed, step, FORCES, 4)
     return Noise(sensors, force)
 
 
