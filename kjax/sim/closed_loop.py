@@ -21,7 +21,7 @@ from kjax.legs.base import build_base
 from kjax.robots import Robot
 from kjax.sim.episode import FALL_HEIGHT, FALL_TILT
 from kjax.sim.excitation import perturb
-from kjax.sim.noise import FORCES, SENSORS, add_noise, noise_dim, normal
+from kjax.sim.noise import add_noise, force_row, sensor_row
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.resolve import BatchSpec, EpisodeParams, SceneSpec
 from kjax.types import Observation, RobotParams
@@ -187,10 +187,9 @@ def draw_noise(scene: SceneSpec, episode: EpisodeParams, step: Array) -> Noise:
     """Noise of a physics step of an episode, float32."""
     sensors = force = jnp.zeros(0, jnp.float32)
     if scene.noise:
-        row = normal(episode.seed, step, SENSORS, noise_dim(scene.base))
-        sensors = row * episode.noise_scale
+        sensors = sensor_row(episode.seed, step, scene.base) * episode.noise_scale
     if scene.force_noise:
-        force = episode.force_noise * normal(episode.seed, step, FORCES, 4)
+        force = episode.force_noise * force_row(episode.seed, step)
     return Noise(sensors, force)
 
 

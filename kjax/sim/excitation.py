@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from kjax.config import NoiseConfig, RunConfig
-from kjax.sim.noise import FORCES, normal
+from kjax.sim.noise import force_rows
 
 
 def force_deviation(noise: NoiseConfig) -> float:
@@ -22,7 +22,7 @@ def force_deviation(noise: NoiseConfig) -> float:
 def force_noise(config: RunConfig, ticks: int) -> Float[np.ndarray, "ticks 4"]:
     """Forces [N] that an episode adds at its control ticks."""
     per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    rows = normal(config.seed, np.arange(ticks) * per_tick, FORCES, 4, np)
+    rows = force_rows(config.seed, np.arange(ticks) * per_tick)
     return rows * np.float32(force_deviation(config.noise))
 
 

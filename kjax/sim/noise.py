@@ -1,17 +1,16 @@
 """Sensor noise, alike on every engine: of a step of an episode, from its seed and number alone.
 
-A random number is the sum of eight bytes of two hashes of seed, stream, step and sensor: integers,
-so that NumPy and JAX give the same bits. It is normal but for the far ends (kurtosis -0.15, never
-beyond 4.9 standard deviations). JAX's own generator costs as much as all else of a controller's
-call. A table to read from costs less still, but XLA spreads that read over its thread pool, and a
-batch of LAPACK calls behind it then waits for ever for the thread that it runs on.
+JAX's counter-based generator costs as much as all else of a controller's call in a batch. Integer
+hashes cost a quarter of it, and a table to read from less still; but with either two threads of the
+batch engine hung in XLA under load, which they have not been seen to do with this generator.
 """
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from kjax.config import NoiseConfig, RunConfig
 from kjax.types import Observation
@@ -42,43 +41,44 @@ def noise_scale(config: NoiseConfig, base: str = "planar") -> Float[np.ndarray, 
     return scale * config.enabled
 
 
-SENSORS, FORCES = 1, 2  # streams
-_GOLDEN = np.uint32(0x9E3779B9)  # 2^32 over the golden ratio
-_MEAN = 8 * 127.5  # of a sum of eight bytes
-_SPREAD = float(np.sqrt(8 * (256**2 - 1) / 12))  # its standard deviation
+# Streams: of the planar base's sensors, of what a free base has besides, of forces.
+_PLANAR, _FREE, _FORCES = 1, 2, 3
 
 
-def _mixed(number: Any) -> Any:
-    """A hash of 32 bits (the finalizer of MurmurHash3), of NumPy or JAX arrays of uint32."""
-    number = (number ^ (number >> 16)) * np.uint32(0x85EBCA6B)
-    number = (number ^ (number >> 13)) * np.uint32(0xC2B2AE35)
-    return number ^ (number >> 16)
+def _draw(seed: Any, step: Any, stream: int, count: int) -> Any:
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), stream), step)
+    return jax.random.normal(key, (count,), jnp.float32)
 
 
-def normal(seed: Any, step: Any, stream: int, count: int, xp: Any = jnp) -> Any:
-    """Standard normal numbers (..., count) of steps (...) of an episode, float32.
+def sensor_row(seed: Int[Array, ""], step: Int[Array, ""], base: str) -> Float[Array, "n"]:
+    """Standard normal numbers of an episode's physics step, n of ``noise_dim``, float32."""
+    planar = _draw(seed, step, _PLANAR, NOISE_DIM)
+    if base == "planar":
+        return planar
+    return jnp.concatenate([planar, _draw(seed, step, _FREE, FREE_NOISE_DIM - NOISE_DIM)])
 
-    Args:
-      seed: of the episode, integer.
-      step: physics steps, integers (...).
-      stream: what they are for.
-      count: how many of each step.
-      xp: array module to compute with, ``numpy`` or ``jax.numpy``; both give the same.
-    """
-    with np.errstate(over="ignore"):
-        first = xp.asarray(seed).astype(np.uint32) * _GOLDEN + np.uint32(stream)
-        place = _mixed(_mixed(first) ^ xp.asarray(step).astype(np.uint32))
-        index = xp.arange(1, count + 1).astype(np.uint32) * _GOLDEN
-        words = [_mixed(one[..., None] + index) for one in (place, ~place)]
-    total = sum((word >> shift) & np.uint32(255) for word in words for shift in (0, 8, 16, 24))
-    return (total.astype(np.float32) - np.float32(_MEAN)) * np.float32(1.0 / _SPREAD)
+
+def force_row(seed: Int[Array, ""], step: Int[Array, ""]) -> Float[Array, "4"]:
+    """The same for forces (front x, z, rear x, z) of the tick that begins at a physics step."""
+    return _draw(seed, step, _FORCES, 4)
+
+
+_sensor_rows = jax.jit(jax.vmap(sensor_row, in_axes=(None, 0, None)), static_argnums=2)
+_force_rows = jax.jit(jax.vmap(force_row, in_axes=(None, 0)))
 
 
 def sensor_noise(config: RunConfig, steps: int, start: int = 0) -> np.ndarray:
     """Noise (steps, n) of an episode from step ``start`` on; n is 30, or 36 for a free base."""
     scale = noise_scale(config.noise, config.sim.base).astype(np.float32)
-    numbers = np.arange(start, start + steps)
-    return normal(config.seed, numbers, SENSORS, len(scale), np) * scale
+    if not scale.any():
+        return np.zeros((steps, len(scale)), np.float32)
+    numbers = np.arange(start, start + steps, dtype=np.int32)
+    return np.asarray(_sensor_rows(np.int32(config.seed), numbers, config.sim.base)) * scale
+
+
+def force_rows(seed: int, steps: np.ndarray) -> np.ndarray:
+    """``force_row`` of many steps, (steps, 4)."""
+    return np.asarray(_force_rows(np.int32(seed), steps.astype(np.int32)))
 
 
 def add_noise(observation: Observation, noise: Float[Array, "noise"]) -> Observation:

@@ -11,7 +11,7 @@ from kjax.config import RunConfig, load_config
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.excitation import force_noise, perturb
-from kjax.sim.noise import FORCES, normal
+from kjax.sim.noise import force_row
 from kjax.sim.resolve import batch_spec
 
 SHORT = {
@@ -42,7 +42,7 @@ def test_noise_depends_on_the_seed_and_the_tick_and_has_the_size_asked_for():
     assert one.std(axis=0) == pytest.approx(12.0, rel=0.05)  # 3 sigma of 2,000 draws
     assert np.abs(np.corrcoef(one.T) - np.eye(4)).max() < 0.08
     np.testing.assert_array_equal(one[:60], force_noise(config(), 60))
-    row = normal(jnp.asarray(5), jnp.asarray(35), FORCES, 4)  # tick 7 of 5 steps
+    row = force_row(jnp.asarray(5), jnp.asarray(35))  # tick 7 of 5 steps
     np.testing.assert_allclose(one[7], 12.0 * np.asarray(row), rtol=1e-6)
     assert np.abs(force_noise(config(seed=6), 60) - one[:60]).max() > 1.0
 

@@ -30,6 +30,7 @@ from kjax.sim.scene import apply_scene, build_model
 OnTick = Callable[[int, int, mujoco.MjData], None]
 
 _KEPT = 4  # programs that an engine keeps
+_NOISE_TICKS = 1000  # noise is drawn for so many ticks at once
 
 
 class MujocoEngine:
@@ -71,6 +72,8 @@ class MujocoEngine:
         self.observe = build_observe(self.robot, self.model, config.sim.contact_threshold)
         self._programs: dict[Hashable, Program] = {}
         self.program(config)
+        # The noise's program as well: a Ctrl-C during a compilation can take the process down.
+        sensor_noise(config, _NOISE_TICKS * self._per_tick)
 
     def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
         """Closed loops of all configs, one after the other, each until its end or its fall.
@@ -147,7 +150,7 @@ class MujocoEngine:
             sensed[cuts[0] : cuts[1]] = data.qvel
             sensed[cuts[1] : cuts[2]] = data.sensordata
             if noisy:
-                sensed[cuts[2] : cuts[3]] = noise[step % per_tick]
+                sensed[cuts[2] : cuts[3]] = noise[step % piece]
             return sensed
 
         qpos, qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
@@ -159,7 +162,9 @@ class MujocoEngine:
         delay = int(episode.delay)
         push = push_at(episode, np.arange(steps)[:, None])
         logs: list[np.ndarray] = []
-        noise = sensor_noise(config, per_tick)
+        # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
+        piece = _NOISE_TICKS * per_tick
+        noise = sensor_noise(config, piece)
         state = program.init(sense(0), requests(config))
 
         fell = interrupted = False
@@ -167,7 +172,8 @@ class MujocoEngine:
         begin = time.perf_counter()
         try:
             for tick in _until_ctrl_c(range(ticks)):
-                noise = sensor_noise(config, per_tick, tick * per_tick)
+                if tick > 0 and tick % _NOISE_TICKS == 0:
+                    noise = sensor_noise(config, piece, tick * per_tick)
                 sense(tick * per_tick)
                 sensed[cuts[3] :] = added[tick]
                 clock = time.perf_counter()
