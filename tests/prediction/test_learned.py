@@ -275,7 +275,7 @@ def put(index, value):
     ("changes", "message"),
     [
         ({"states": put((3, 7, 2), np.nan)}, "states: 1 of 6 rollouts.*the first one is rollout 3"),
-        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold parameters that are not"),
+        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold numbers that are not"),
         ({"states": lambda a: a[..., :5]}, r"states: got shape \(6, 21, 5\), wanted"),
         ({"inputs": lambda a: a[:, :-1]}, r"inputs: got shape \(6, 19, 4\), wanted \(6, 20, 4\)"),
         ({"feet": lambda a: a[:1]}, r"feet: got shape \(1, 2, 2\), wanted \(6, 2, 2\)"),

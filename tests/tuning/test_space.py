@@ -85,7 +85,7 @@ def test_the_mass_of_a_rigid_body_model_is_a_variable_of_its_prediction():
     config = load_config(RunConfig, None, {"koopman.model": "planted", "koopman.feet": "measured"})
     space = build_space(config, ["srb.mass", "srb.inertia"])
     heavier = {**space.start, "srb.mass": space.start["srb.mass"] + jnp.log(2.0)}
-    body = space.params(heavier).fits.prediction.numbers.body
+    body = space.params(heavier).fits.prediction.params.body
     np.testing.assert_allclose(body.mass, 2.0 * go1.PARAMS.mass, rtol=1e-12)
     np.testing.assert_allclose(body.inertia, go1.PARAMS.pitch_inertia, rtol=1e-12)
 
