@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import ConfigError, RunConfig
-from kjax.runs.cache import Cache, CacheError
+from kjax.runs.cache import Cache, open_cache
 from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
 from kjax.sim.episode import SETTLE_TIME, Trajectory, metrics
 from kjax.sim.summary import summarise
@@ -73,7 +73,7 @@ def main() -> None:
         require_display()
     cli.configure_jax(one_core=True)
     folder = cli.output_folder(args, "closed_loop")
-    cache = None if args.seeds is None else open_seeds(folder, restart=args.restart)
+    cache = None if args.seeds is None else open_cache(folder, fresh=args.restart)
     clock = time.perf_counter()
     try:
         simulation = MujocoEngine(config)
@@ -182,14 +182,6 @@ def _simulate_in_viewer(simulation: MujocoEngine, config: RunConfig, on_tick: On
     finally:
         if viewer is not None:
             viewer.close()
-
-
-def open_seeds(folder: Path, *, restart: bool = False) -> Cache:
-    """The finished seeds of a folder."""
-    try:
-        return Cache(folder, fresh=restart)
-    except CacheError as error:
-        cli.fail(str(error))
 
 
 def run_seeds(

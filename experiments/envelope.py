@@ -26,8 +26,8 @@ from paper_results import CONFIGS, cycle
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, load_config
 from kjax.runs.bisection import bisect
-from kjax.runs.cache import Cache, CacheError
-from kjax.runs.pool import Run, open_runner, read_runner
+from kjax.runs.cache import open_cache
+from kjax.runs.pool import Run, cached_runner, open_runner
 
 SHARE = 0.95  # of the seeds that must pass
 SPEED = 0.2  # largest relative error of the mean speed
@@ -139,16 +139,13 @@ def main() -> None:
     args = _parse()
     folder = cli.output_folder(args, "envelope")
     cli.configure_jax(one_core=args.jobs == 1)
-    try:
-        cache = Cache(folder)
-    except CacheError as error:
-        cli.fail(str(error))
+    cache = open_cache(folder)
     found: dict[str, Any] = {}
     for axis in AXES:  # what is not asked for now stays in the figure, if it is there whole
         for base in ("planar", "free"):
             if axis.name not in args.only or base not in args.bases:
                 with suppress(KeyError):
-                    found[f"{axis.name}_{base}"] = _search(axis, base, args, read_runner(cache))
+                    found[f"{axis.name}_{base}"] = _search(axis, base, args, cached_runner(cache))
     try:
         with open_runner(cache, jobs=args.jobs) as run:
             for axis in AXES:

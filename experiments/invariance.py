@@ -30,7 +30,7 @@ from prediction_models import MODELS
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, load_config
 from kjax.runs.batches import batch_key, run_batch
-from kjax.runs.cache import Cache, CacheError
+from kjax.runs.cache import Cache, open_cache
 from kjax.sim.intervals import median_interval
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -96,10 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parse(argv)
     folder = cli.output_folder(args, "invariance")
     cli.configure_jax()
-    try:
-        cache = Cache(folder)
-    except CacheError as error:
-        cli.fail(str(error))
+    cache = open_cache(folder)
     parts = list(_parts(args))
     try:
         for number, part in enumerate(parts, start=1):

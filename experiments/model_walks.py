@@ -18,7 +18,7 @@ from prediction_models import MODELS, residual
 
 from kjax import cli
 from kjax.config import Gaits, RunConfig, load_config
-from kjax.runs.cache import Cache, CacheError
+from kjax.runs.cache import Cache, open_cache
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
@@ -45,10 +45,7 @@ def main() -> None:
         walks = json.loads(file.read_text(encoding="utf-8"))["walks"]
         return figure(walks, folder / "figure.png")
     cli.configure_jax()
-    try:
-        cache = Cache(folder, Path(__file__))
-    except CacheError as error:
-        cli.fail(str(error))
+    cache = open_cache(folder, Path(__file__))
     clock, walks = time.perf_counter(), {}
     studies = {
         f"{gait}, {name}" + (", quick" if args.quick else ""): Study(gait, name, keys, args.quick)

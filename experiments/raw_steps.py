@@ -29,7 +29,7 @@ from kjax import cli
 from kjax.config import CommandConfig, RunConfig, load_config
 from kjax.robots import get_robot
 from kjax.runs.batches import batch_key, run_batch
-from kjax.runs.cache import Cache, CacheError
+from kjax.runs.cache import Cache, open_cache
 from kjax.sim.contacts import body_contact
 from kjax.sim.episode import Trajectory
 from kjax.sim.intervals import median_interval, wilson
@@ -89,10 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parse(argv)
     folder = cli.output_folder(args, "raw_steps")
     cli.configure_jax()
-    try:
-        cache = Cache(folder, Path(__file__))
-    except CacheError as error:
-        cli.fail(str(error))
+    cache = open_cache(folder, Path(__file__))
     chosen = [
         Case(gait=gait, base=base, forces=forces)
         for forces in args.forces for gait in args.gaits for base in args.bases

@@ -21,8 +21,8 @@ from paper_results import CONFIGS, EXPERIMENTS, RMSE, Experiment, Row, base_conf
 from kjax import cli
 from kjax.config import ConfigError, FitStudyConfig, load_config
 from kjax.runs.batches import batch_key, run_batch
-from kjax.runs.cache import Cache, CacheError
-from kjax.runs.pool import Run, open_runner, read_runner
+from kjax.runs.cache import Cache, open_cache
+from kjax.runs.pool import Run, cached_runner, open_runner
 from kjax.sim.engines.contract import Torques
 from kjax.sim.intervals import median_interval, paired_difference, wilson
 from kjax.sim.series import Series, load_series, save_series
@@ -105,14 +105,6 @@ def _parse() -> Namespace:
     return args
 
 
-def open_cache(folder: Path, *code: Path) -> Cache:
-    """The finished results of a folder; ends the program where one is damaged."""
-    try:
-        return Cache(folder, *code)
-    except CacheError as error:
-        cli.fail(str(error))
-
-
 def _add_finished(found: dict[str, Any], folder: Path, args: Namespace, cache: Cache) -> None:
     """Put on the page what is not asked for now but lies finished in the cache, of this code."""
     left_off = []
@@ -121,7 +113,7 @@ def _add_finished(found: dict[str, Any], folder: Path, args: Namespace, cache: C
             if base in found.get(experiment.name, {}):
                 continue
             try:
-                one = _measure(experiment, base, args, cache, read_runner(cache), run=False)
+                one = _measure(experiment, base, args, cache, cached_runner(cache), run=False)
                 found.setdefault(experiment.name, {})[base] = one
             except KeyError:
                 left_off.append(f"{experiment.name} ({base})")

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig
-from kjax.runs.cache import Cache, CacheError
+from kjax.runs.cache import Cache, open_cache
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.summary import summarise
@@ -57,10 +57,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     except ValueError as error:
         cli.fail(f"--{error}" if str(error).startswith("keys") else str(error))
     begin = worsened(space, args.worsen, args.worsen_seed)
-    try:
-        cache = Cache(folder, Path(__file__))
-    except CacheError as error:
-        cli.fail(str(error))
+    cache = open_cache(folder, Path(__file__))
     key = cache.key(short, _settings(args))
     cache.folder.mkdir(exist_ok=True)
     train, held_out = (

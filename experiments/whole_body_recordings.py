@@ -8,7 +8,7 @@ import numpy as np
 
 from kjax import cli
 from kjax.config import RunConfig, load_config
-from kjax.runs.cache import Cache, CacheError
+from kjax.runs.cache import Cache, CacheError, open_cache
 from kjax.sysid.transitions import Episode
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -62,8 +62,8 @@ def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[
 
 def kept(kind: str, args: Any, folder: Path) -> dict[str, np.ndarray] | None:
     """A kind's recording where it lies in the folder; ends the program where it is damaged."""
+    cache = open_cache(folder, Path(__file__))
     try:
-        cache = Cache(folder, Path(__file__))
         return cache.arrays(_key(cache, kind, args))
     except CacheError as error:
         cli.fail(str(error))
@@ -82,7 +82,7 @@ def record(kind: str, args: Any, folder: Path) -> list[Episode]:
         print(f"{kind}: {args.robots} episodes of {args.duration:g} s are there", flush=True)
         return _episodes(there)
     configs = kind_configs(kind, args.robots, args.duration, args.force)
-    cache = Cache(folder, Path(__file__))
+    cache = open_cache(folder, Path(__file__))
     print(f"{kind}: recording {args.robots} episodes of {args.duration:g} s ...", flush=True)
     begin = time.perf_counter()
     run = BatchEngine(configs[0], torques="held").run(configs)

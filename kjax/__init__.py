@@ -13,13 +13,13 @@ from kjax.controllers.controller import Controller, build_controller
 from kjax.controllers.observation import check_observation
 from kjax.controllers.params import ControllerParams, Tables, condense
 from kjax.controllers.resolve import resolve
-from kjax.moved import tell_of_moves
+from kjax.moved import install_moved_finder
 from kjax.spec import ControllerSpec
 from kjax.types import Command, JointCommand, Leg, Mode, Observation
 
 __version__ = "0.1.0"
 
-tell_of_moves()
+install_moved_finder()
 
 _MOVED = {"build_params": "resolve(config, robot), then condense(spec, params)"}
 

@@ -25,7 +25,7 @@ import tomli_w
 
 from kjax.config import ConfigError, GaitConfig, RunConfig, fields, load_config, to_dict
 from kjax.config.gaits import LIBRARY
-from kjax.config.loading import what_became_of
+from kjax.config.loading import replacement_of
 from kjax.robots import get_robot
 
 T = TypeVar("T")
@@ -163,7 +163,7 @@ def parse(
     args, unknown = parser.parse_known_args(_join_values(words))
     for word in unknown:
         name = word.split("=")[0]
-        became = what_became_of(name.removeprefix("--"))
+        became = replacement_of(name.removeprefix("--"))
         if became:
             fail(f"{name}: {became}")
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)

@@ -46,7 +46,7 @@ class MovedFinder:
         return None
 
 
-def tell_of_moves() -> None:
+def install_moved_finder() -> None:
     """Let imports of old modules fail with the new name."""
     if MovedFinder not in sys.meta_path:
         sys.meta_path.append(MovedFinder)

@@ -105,7 +105,7 @@ RETIRED = {
 }
 
 
-def what_became_of(key: str) -> str:
+def replacement_of(key: str) -> str:
     """What has become of a key of an earlier version; empty for a key that there never was."""
     section, _, leaf = key.rpartition(".")
     if section.startswith("gaits.") and leaf in _RESCALED_GAIT:
@@ -226,7 +226,7 @@ def _explain(error: ValidationError, cls: type) -> str:
     key = ".".join(loc)
     came = first["input"]
     if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        became = what_became_of(key)
+        became = replacement_of(key)
         if became:
             return f"{key}: {became}"
         inner = [old for old in RETIRED if old.startswith(f"{key}.")]

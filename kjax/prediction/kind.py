@@ -4,7 +4,6 @@
 one's own. Everything else asks the record.
 """
 
-import difflib
 import importlib
 import pkgutil
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax.config import ConfigError, KoopmanConfig
 from kjax.dynamics.srb_planar import SrbParams
+from kjax.lookup import look_up
 from kjax.prediction.families import Family
 from kjax.spec import ModelSpec
 from kjax.types import Mode
@@ -60,14 +60,17 @@ class ModelKind(NamedTuple):
 
 
 @cache
-def model_kinds() -> dict[str, ModelKind]:
-    """The kinds that kjax has, by name."""
+def model_kinds() -> dict[str, str]:
+    """The kinds that kjax has: name -> where each lies, as ``"module:NAME"``."""
     import kjax.prediction.kinds as package
 
-    found: dict[str, ModelKind] = {}
-    for one in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
-        found |= importlib.import_module(f"{package.__name__}.{one}").KINDS
-    return found
+    modules = [f"{package.__name__}.{one.name}" for one in pkgutil.iter_modules(package.__path__)]
+    return {
+        name.lower(): f"{module}:{name}"
+        for module in sorted(modules)
+        for name, value in vars(importlib.import_module(module)).items()
+        if isinstance(value, ModelKind)
+    }
 
 
 def get_kind(name: str) -> ModelKind:
@@ -76,23 +79,8 @@ def get_kind(name: str) -> ModelKind:
     Raises:
       ConfigError: for a name that is none.
     """
-    module, _, attribute = name.partition(":")
-    if attribute:
-        try:
-            kind = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
-            raise ConfigError(f"koopman.model: '{name}' cannot be loaded: {error}") from None
-        if not isinstance(kind, ModelKind):
-            raise ConfigError(
-                f"koopman.model: '{name}' is a {type(kind).__name__}, wanted a ModelKind"
-            )
-        return kind
-    known = model_kinds()
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
-        raise ConfigError(
-            f"koopman.model: got '{name}', wanted one of {', '.join(known)}, or 'module:NAME' for "
-            f"a ModelKind of your own{hint}"
-        )
-    return known[name]
+    try:
+        kind: ModelKind = look_up("koopman.model", name, model_kinds(), ModelKind)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    return kind

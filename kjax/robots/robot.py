@@ -4,8 +4,6 @@ A robot of one's own is a module with a ``Robot`` in it; ``robot = "module:NAME"
 it, ``get_robot`` loads it.
 """
 
-import difflib
-import importlib
 import pkgutil
 from dataclasses import dataclass, field
 from importlib.resources.abc import Traversable
@@ -13,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kjax.lookup import look_up
 from kjax.types import Leg, RobotParams
 
 DEFAULT = "go1"
@@ -78,21 +77,6 @@ def get_robot(name: str = DEFAULT) -> Robot:
     Raises:
       ValueError: for a name that is none.
     """
-    module, _, attribute = name.partition(":")
-    if not attribute:
-        known = robot_names()
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise ValueError(
-                f"robot: got '{name}', wanted one of {', '.join(known)}, or 'module:NAME' for a "
-                f"Robot of your own{hint}"
-            )
-        module, attribute = f"kjax.robots.{name}", "ROBOT"
-    try:
-        robot = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"robot: '{name}' cannot be loaded: {error}") from None
-    if not isinstance(robot, Robot):
-        raise ValueError(f"robot: '{name}' is a {type(robot).__name__}, wanted a Robot")
+    known = {one: f"kjax.robots.{one}:ROBOT" for one in robot_names()}
+    robot: Robot = look_up("robot", name, known, Robot)
     return robot

@@ -169,6 +169,14 @@ class Cache:
             ) from None
 
 
+def open_cache(folder: Path, *code: Path, fresh: bool = False) -> Cache:
+    """A script's ``Cache``: a damaged one ends the program with one line."""
+    try:
+        return Cache(folder, *code, fresh=fresh)
+    except CacheError as error:
+        cli.fail(str(error))
+
+
 @contextmanager
 def lock(folder: Path, name: str = "lock") -> Iterator[None]:
     """Keep a folder to this process; the system frees it however the process ends.

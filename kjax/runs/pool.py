@@ -58,18 +58,13 @@ def open_runner(cache: Cache, *, jobs: int = 1, record: Record | None = None) ->
         pool.shutdown(cancel_futures=True)
 
 
-def read_runner(cache: Cache) -> Run:
+def cached_runner(cache: Cache) -> Run:
     """A function as of ``open_runner`` that runs nothing; ``KeyError`` for a missing result."""
 
     def nothing(tasks: list[Task]) -> Iterator[tuple[str, dict[str, Any]]]:
         raise KeyError(tasks[0][0])
 
     return lambda configs, **more: _run(cache, configs, nothing, None, **more)
-
-
-def series_file(cache: Cache, config: RunConfig) -> Path:
-    """Where ``record`` is to leave what it keeps of an episode."""
-    return cache.path(cache.key(config), ".npz")
 
 
 def _run(

@@ -141,7 +141,7 @@ def empty_log(ticks: int, log: TickLog) -> TickLog:
     return TickLog(*(np.zeros((ticks, *leaf.shape), leaf.dtype) for leaf in log))
 
 
-def side_by_side(recordings: Sequence[Recording]) -> Recording:
+def concatenate(recordings: Sequence[Recording]) -> Recording:
     """Recordings of one rate as one; shorter ones are filled up with zeros."""
     first = recordings[0]
 

@@ -51,7 +51,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         velocity.plot(t, moving_mean(run.x[:, 3], window), color=BLUE, label="mean over a stride")
         velocity.plot(t, run.velocity_command, "--", color=DARK, lw=1.1, label="command")
         velocity.set_ylabel("v_x [m/s]")
-        velocity.legend(ncol=3, loc="upper left")
+        _legend_above(velocity)
         velocity.set_title(title, loc="left", fontsize=9)
 
         if free_base.is_free(run.qpos):
@@ -62,7 +62,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
         pitch.set_ylabel("pitch [deg]\nnose up +")
         if free_base.is_free(run.qpos):
             pitch.set_ylabel("angles [deg]")
-            pitch.legend(ncol=3, loc="upper left")
+            _legend_above(pitch)
 
         height.plot(t, run.x[:, 1], color=BLUE)
         height.plot(t, reference_height(run.gait, t, config), ls="--", color=DARK, lw=0.9)
@@ -108,6 +108,13 @@ def zoom_window(end: float, config: RunConfig) -> tuple[float, float]:
     centre = max(steps)[1] + 0.5 if steps else end - 1.0
     start = max(0.0, min(centre - 1.0, end - 2.0))
     return start, min(end, start + 2.0)
+
+
+def _legend_above(axis: Axes) -> None:
+    """A legend in one row, with room of its own above the curves."""
+    low, high = axis.get_ylim()
+    axis.set_ylim(low, high + 0.18 * (high - low))
+    axis.legend(ncol=3, loc="upper left")
 
 
 def _forces(axis: Axes, run: Trajectory, part: np.ndarray) -> None:

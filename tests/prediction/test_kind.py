@@ -25,9 +25,7 @@ def test_the_kinds_of_kjax():
     assert set(model_kinds()) == {
         "linear", "bilinear", "srb_hover", "srb", "planted", "exact", "residual", "learned"
     }  # fmt: skip
-    assert [name for name, kind in model_kinds().items() if kind.takes_file] == [
-        "residual", "learned"
-    ]  # fmt: skip
+    assert {name for name in model_kinds() if get_kind(name).takes_file} == {"residual", "learned"}
 
 
 @pytest.mark.parametrize(

@@ -76,12 +76,12 @@ def test_killed_and_resumed_equals_uninterrupted(config, tmp_path, monkeypatch):
         assert started == [None, 2]
         assert go(chosen) == resumed  # finished: nothing runs, or `killed` would have ended it
     assert without_times(resumed) == without_times(expected)
-    assert pool.read_runner(Cache(tmp_path))(chosen) == resumed
+    assert pool.cached_runner(Cache(tmp_path))(chosen) == resumed
 
 
 def test_a_runner_that_reads_only_says_what_is_missing(config, tmp_path):
     with pytest.raises(KeyError):
-        pool.read_runner(Cache(tmp_path))(seeds(config, 1))
+        pool.cached_runner(Cache(tmp_path))(seeds(config, 1))
 
 
 def test_another_config_is_another_episode(config, tmp_path):
@@ -149,7 +149,7 @@ def test_what_is_recorded_of_a_run_is_made_again_where_it_is_missing(config, tmp
 
     with pool.open_runner(cache, record=record) as run:
         run([one])
-        file = pool.series_file(cache, one)
+        file = cache.path(cache.key(one), ".npz")
         assert np.load(file)["x"].shape == (700, 6)
         file.unlink()
         run([one])

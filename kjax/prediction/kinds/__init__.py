@@ -1,1 +1,1 @@
-"""The kinds of prediction models that kjax has: each module holds ``KINDS``, records by name."""
+"""The kinds of prediction models that kjax has: each ``ModelKind`` of a module, by its name."""

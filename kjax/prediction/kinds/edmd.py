@@ -64,7 +64,5 @@ def _fit_bilinear(
     return model, report.residual_rms, report.finite.all()
 
 
-KINDS = {
-    "linear": ModelKind(family=partial(_family, families.linear), params=None, spec=_spec),
-    "bilinear": ModelKind(family=partial(_family, families.bilinear), params=_bilinear, spec=_spec),
-}
+LINEAR = ModelKind(family=partial(_family, families.linear), params=None, spec=_spec)
+BILINEAR = ModelKind(family=partial(_family, families.bilinear), params=_bilinear, spec=_spec)

@@ -29,13 +29,11 @@ def _certain(bodies: Bodies) -> Any:
     return jnp.zeros((len(bodies.modes), STATE_DIM))
 
 
-KINDS = {
-    "srb_hover": ModelKind(
-        family=lambda spec: families.linear(states_only(), spec.dt, "srb_hover"),
-        params=_hover,
-        of_height=True,
-    ),
-    "srb": ModelKind(lambda spec: families.rigid_body(spec.dt), _body, is_body=True),
-    "planted": ModelKind(lambda spec: families.planted(spec.dt), _body, is_body=True),
-    "exact": ModelKind(lambda spec: families.exact(spec.dt), _body, is_body=True),
-}
+SRB_HOVER = ModelKind(
+    family=lambda spec: families.linear(states_only(), spec.dt, "srb_hover"),
+    params=_hover,
+    of_height=True,
+)
+SRB = ModelKind(lambda spec: families.rigid_body(spec.dt), _body, is_body=True)
+PLANTED = ModelKind(lambda spec: families.planted(spec.dt), _body, is_body=True)
+EXACT = ModelKind(lambda spec: families.exact(spec.dt), _body, is_body=True)

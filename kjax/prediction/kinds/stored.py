@@ -60,17 +60,15 @@ def _read(path: Path, family: str, changed: tuple[int, int, int]) -> storage.Sto
     return storage.load(path, family)
 
 
-KINDS = {
-    "residual": ModelKind(
-        family=_residual_family,
-        params=_residual,
-        spec=lambda config, spec: replace(spec, features=_stored(config).features),
-        takes_file=True,
-    ),
-    "learned": ModelKind(
-        family=lambda spec: learned(spec.dt, spec.lifted),
-        params=_of_modes,
-        spec=_lifted,
-        takes_file=True,
-    ),
-}
+RESIDUAL = ModelKind(
+    family=_residual_family,
+    params=_residual,
+    spec=lambda config, spec: replace(spec, features=_stored(config).features),
+    takes_file=True,
+)
+LEARNED = ModelKind(
+    family=lambda spec: learned(spec.dt, spec.lifted),
+    params=_of_modes,
+    spec=_lifted,
+    takes_file=True,
+)

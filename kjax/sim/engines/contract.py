@@ -1,7 +1,5 @@
 """What every engine takes and returns: configs of one spec, a ``Recording``."""
 
-import difflib
-import importlib
 import pkgutil
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -10,6 +8,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from kjax.config import RunConfig
+from kjax.lookup import look_up
 from kjax.sim.recording import Recording
 from kjax.sim.resolve import BatchSpec, batch_spec
 
@@ -61,21 +60,9 @@ def get_engine(name: str) -> type[Engine]:
     """
     import kjax.sim.engines as package
 
-    module, _, attribute = name.partition(":")
-    if not attribute:
-        found = {one.name for one in pkgutil.iter_modules(package.__path__)} - {"contract"}
-        if name not in found:
-            near = difflib.get_close_matches(name, found, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise ValueError(
-                f"engine: got '{name}', wanted one of {', '.join(sorted(found))}, or 'module:NAME' "
-                f"for one of your own{hint}"
-            )
-        module, attribute = f"{package.__name__}.{name}", "ENGINE"
-    try:
-        engine: type[Engine] = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"engine: '{name}' cannot be loaded: {error}") from None
+    modules = sorted(one.name for one in pkgutil.iter_modules(package.__path__))
+    known = {one: f"{package.__name__}.{one}:ENGINE" for one in modules if one != "contract"}
+    engine: type[Engine] = look_up("engine", name, known, type)
     return engine
 
 

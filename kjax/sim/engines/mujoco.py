@@ -21,7 +21,7 @@ from kjax.sim.excitation import force_deviation, force_noise
 from kjax.sim.noise import noise_dim, sensor_noise
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.program import Program, build_program, requests
-from kjax.sim.recording import Recording, side_by_side
+from kjax.sim.recording import Recording, concatenate
 from kjax.sim.resolve import batch_spec, push_at, resolve_scene
 from kjax.sim.scene import apply_scene, build_model
 
@@ -101,7 +101,7 @@ class MujocoEngine:
                 parts[-1] = dataclasses.replace(parts[-1], interrupted=True)
             if parts[-1].interrupted:
                 break
-        return side_by_side(parts)
+        return concatenate(parts)
 
     @staticmethod
     def check(config: RunConfig, torques: Torques) -> None:

@@ -1,0 +1,36 @@
+"""Objects by name: one of kjax's, or one's own as ``"module:NAME"``."""
+
+import difflib
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+
+def look_up(key: str, name: str, known: Mapping[str, str], wanted: type) -> Any:
+    """What a name stands for.
+
+    Args:
+      key: of the config, for errors.
+      name: one of ``known``, or ``"module:NAME"``.
+      known: names, and where each lies as ``"module:NAME"``.
+      wanted: class of the object, or ``type`` for a class.
+
+    Raises:
+      ValueError: for a name that is none, or an object of another class.
+    """
+    place = known.get(name, name)
+    module, _, attribute = place.partition(":")
+    if not attribute:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        raise ValueError(
+            f"{key}: got '{name}', wanted one of {', '.join(known)}, or 'module:NAME' for a "
+            f"{wanted.__name__} of your own{hint}"
+        )
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{key}: '{name}' cannot be loaded: {error}") from None
+    if not isinstance(found, wanted):
+        raise ValueError(f"{key}: '{name}' is a {type(found).__name__}, wanted a {wanted.__name__}")
+    return found
