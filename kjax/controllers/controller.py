@@ -7,6 +7,7 @@ under ``vmap`` alike. The caller owns ``jit``.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from kjax import gait, qp
+from kjax.controllers.acting import build_act, facing
 from kjax.controllers.command import IGNORED
 from kjax.controllers.observation import (
-    MAX_JOINT_RATE,
     cast,
     check_observation,
     is_concrete,
@@ -27,8 +28,8 @@ from kjax.controllers.params import ControllerParams, Tables
 from kjax.controllers.planning import ForceTask, Planner, build_planner
 from kjax.controllers.reference import next_clock, next_reference
 from kjax.controllers.state import ControllerState, PlanInfo
-from kjax.legs import contact, lateral, swing
-from kjax.legs.base import Footing, LegCommand, View, build_base, to_local
+from kjax.legs import contact, swing
+from kjax.legs.base import Base, View, build_base, to_local
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc.lmpc import start_memory
 from kjax.spec import ControllerSpec
@@ -81,192 +82,11 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
     """
     if not isinstance(spec, ControllerSpec):
         raise TypeError(f"spec: wanted that of kjax.resolve, got {type(spec).__name__}")
-    control_dt, act_dt = spec.control_dt, spec.act_dt
     base = build_base(spec.base)
-    plan_forces = build_planner(spec) if planner is None else planner
-
-    def init(tables: Tables, observation: Observation) -> ControllerState:
-        if not isinstance(tables, Tables):
-            raise TypeError(f"tables: wanted condense(spec, params), got {type(tables).__name__}")
-        params = tables.params
-        if is_concrete((observation, params.robot)):
-            check_observation(params.robot, observation)
-        observation = cast(observation, params.position_slack.dtype)
-        # The heading of a first sample that is no good is taken from the first good one.
-        valid = is_valid(observation)
-        observation = or_neutral(observation, valid)
-        track = base.track(observation)
-        if track is not None:
-            track = jnp.where(valid, track, 0.0)
-        return init_from(tables, base.view(params.robot, _facing(track), observation), track)
-
-    def init_from(tables: Tables, view: View, track: Array | None = None) -> ControllerState:
-        params = tables.params
-        zero = jnp.zeros_like(params.position_slack)
-        state = ControllerState(
-            time=zero,
-            clock=gait.start(params.gaits[0], zero - control_dt),  # first plan: phase 0
-            stance=jnp.ones((4,), bool),
-            lag=zero,
-            command=jnp.zeros((len(COMMAND_NAMES),), zero.dtype),
-            height=zero,
-            ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
-            velocity=zero,
-            correction=jnp.zeros((2,), zero.dtype),
-            memory=start_memory(tables.lmpc, spec),
-            force=jnp.zeros((4, 3), zero.dtype),
-            swing=swing.initial_swing(view.feet),
-            feet=view.feet,
-            base_vel=view.base_vel,
-            torque=jnp.zeros((4, 3), zero.dtype),
-            blind_time=zero,
-            contact=contact.initial_contact(zero.dtype),
-            track=track,
-        )
-        # A buffer of its own for every leaf, so that the state may be donated.
-        return jax.tree.map(jnp.copy, state)
-
-    def plan(
-        tables: Tables, state: ControllerState, observation: Observation
-    ) -> tuple[ControllerState, PlanInfo]:
-        params = tables.params
-        observation = cast(observation, params.position_slack.dtype)
-        valid = is_valid(observation)
-        observation = or_neutral(observation, valid)
-        if state.track is not None:
-            unset = valid & (state.track == 0.0).all()
-            state = state._replace(track=jnp.where(unset, base.track(observation), state.track))
-        view = base.view(params.robot, _facing(state.track), observation)
-        return plan_from(tables, state, view, observation.contact, valid)
-
-    def plan_from(
-        tables: Tables,
-        state: ControllerState,
-        view: View,
-        flags: Array,
-        valid: Array,
-    ) -> tuple[ControllerState, PlanInfo]:
-        params = tables.params
-        clock = next_clock(params, state, control_dt)
-        where = (clock.gait, clock.phase)
-        stance, mode = params.schedule.stance[where], params.schedule.mode[where]
-        feet = jnp.where(valid, view.feet, state.feet)
-        swings = _next_swings(params, state, clock, stance, flags, feet)
-        heights = feet[:, -1] - params.robot.foot_radius
-        ground = _mean_height(heights, stance, state.ground)
-        wanted = next_reference(params, state, clock, view.planar, control_dt)
-        solved = plan_forces(
-            tables,
-            ForceTask(
-                clock=clock,
-                stance=stance,
-                body=_above_ground(view.planar, ground),
-                valid=valid,
-                lag=wanted.lag,
-                velocity=wanted.velocity + wanted.correction[0],
-                command=wanted.command[0] + wanted.correction[0],
-                height=params.height[clock.gait] + wanted.height,
-                pitch_offset=wanted.correction[1],
-                memory=state.memory,
-            ),
-        )
-        next_state = state._replace(
-            time=state.time + control_dt,
-            clock=clock,
-            stance=stance,
-            lag=jnp.where(valid, wanted.lag, state.lag),
-            command=wanted.command,
-            height=wanted.height,
-            ground=jnp.where(valid, ground, state.ground),
-            velocity=wanted.velocity,
-            correction=jnp.where(valid, wanted.correction, state.correction),
-            memory=solved.memory,
-            force=to_local(view, solved.force),
-            swing=swings,
-            feet=feet,
-        )
-        info = PlanInfo(
-            status=jnp.where(valid, solved.status, qp.Status.NON_FINITE).astype(jnp.int32),
-            residual=jnp.where(valid, solved.residual, jnp.inf),
-            iterations=solved.iterations,
-            mode=mode,
-            x=_above_ground(view.planar, ground).x,
-            reference=solved.reference,
-            contact_fault=contact.is_faulty(state.contact),
-            command_ignored=(wanted.command[IGNORED] != 0.0).any(),
-            blind_time=jnp.where(valid, 0.0, state.blind_time + act_dt),
-        )
-        return next_state, info
-
-    def act(
-        tables: Tables, state: ControllerState, observation: Observation
-    ) -> tuple[ControllerState, JointCommand]:
-        params = tables.params
-        observation = cast(observation, params.position_slack.dtype)
-        valid = is_valid(observation)
-        known = jnp.abs(observation.joint_vel) <= MAX_JOINT_RATE
-        joint_vel = jnp.where(known, observation.joint_vel, 0.0)
-        observation = or_neutral(observation, valid)
-        robot = params.robot
-        view = base.view(robot, _facing(state.track), observation)
-        settings = swing.for_gait(params.swing, state.clock.gait)
-        sideways = lateral.for_gait(params.lateral, state.clock.gait)
-
-        # Step 1: where the feet in the air shall be.
-        swings = swing.advance(state.swing, ~state.stance, act_dt)
-        footing = Footing(
-            remaining=jnp.maximum(swings.duration - swings.elapsed, 0.0),
-            stance_time=params.schedule.stance_time[state.clock.gait, state.clock.phase],
-            velocity=state.velocity + state.correction[0],
-            ground=state.ground,
-        )
-        target = base.foothold(robot, settings, sideways, view, footing)
-        foot, foot_vel = swing.foot_path(settings, swings, target)
-
-        # Step 2: what they have hit meanwhile.
-        flags = contact.read_flags(
-            state.contact,
-            observation.contact & valid,
-            contact.LegPhase(state.stance, state.clock.elapsed, swings.elapsed),
-            contact.FootMotion(view.feet, view.feet_vel),
-            contact.FootMotion(foot, foot_vel),
-            state.ground + robot.foot_radius,
-            act_dt,
-        )
-        flags = flags._replace(flicker=flags.flicker & valid)
-        swings = swing.hold_feet(settings, swings, flags, view.feet, act_dt)
-        foot, foot_vel = swing.held_or_on_path(settings, swings, foot, foot_vel)
-
-        # Step 3: torques, those of the last valid sample for a while, then damping.
-        legs = LegCommand(state.stance & ~swings.reaching, state.force, foot, foot_vel)
-        targets = base.joints(robot, settings, sideways, view, legs, observation)
-        blind_time = jnp.where(valid, 0.0, state.blind_time + act_dt)
-        recent = blind_time < params.hold_time + 0.5 * act_dt
-        held = jnp.where(recent, state.torque, -params.blind_damping * joint_vel)
-        torque = jnp.where(valid, targets.torque, held)
-        torque = jnp.clip(torque, -robot.torque_limit, robot.torque_limit)
-        tracks, damped = targets.tracks & valid, ~valid & ~recent
-        # PD loops of the joints, and what makes them give these torques for this sample.
-        q = jnp.where(tracks, targets.q, observation.joint_pos)
-        dq = jnp.where(tracks, targets.dq, jnp.where(damped, 0.0, joint_vel))
-        kp = jnp.where(tracks, settings.kp, 0.0)
-        kd = jnp.where(tracks, settings.kd, jnp.where(damped, params.blind_damping, 0.0))
-        pd = kp * (q - observation.joint_pos) + kd * (dq - joint_vel)
-        command = JointCommand(torque=torque, q=q, dq=dq, kp=kp, kd=kd, feedforward=torque - pd)
-
-        # Step 4: the local frame moves on with the trunk.
-        base_vel = jnp.where(valid, view.base_vel, state.base_vel)
-        motion = act_dt * base_vel
-        next_state = state._replace(
-            swing=swing.carry_along(swings, motion),
-            ground=state.ground - motion[-1],
-            feet=jnp.where(valid, view.feet, state.feet) - motion,
-            base_vel=base_vel,
-            torque=torque,
-            blind_time=blind_time,
-            contact=jax.tree.map(lambda a, b: jnp.where(valid, a, b), flags.state, state.contact),
-        )
-        return next_state, command
+    init_from = partial(_init_from, spec)
+    plan_from = partial(_plan_from, spec, build_planner(spec) if planner is None else planner)
+    plan = partial(_plan, base, plan_from)
+    act = build_act(base, spec.act_dt)
 
     def step(
         tables: Tables, state: ControllerState, observation: Observation
@@ -276,15 +96,144 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         return state, command, info
 
     return Controller(
-        init=init,
+        init=partial(_init, base, init_from),
         plan=plan,
         act=act,
         step=step,
         init_from=init_from,
         plan_from=plan_from,
-        control_dt=control_dt,
-        act_dt=act_dt,
+        control_dt=spec.control_dt,
+        act_dt=spec.act_dt,
     )
+
+
+def _init(
+    base: Base, init_from: Callable[..., ControllerState], tables: Tables, observation: Observation
+) -> ControllerState:
+    """``Controller.init``."""
+    if not isinstance(tables, Tables):
+        raise TypeError(f"tables: wanted condense(spec, params), got {type(tables).__name__}")
+    params = tables.params
+    if is_concrete((observation, params.robot)):
+        check_observation(params.robot, observation)
+    observation = cast(observation, params.position_slack.dtype)
+    # The heading of a first sample that is no good is taken from the first good one.
+    valid = is_valid(observation)
+    observation = or_neutral(observation, valid)
+    track = base.track(observation)
+    if track is not None:
+        track = jnp.where(valid, track, 0.0)
+    return init_from(tables, base.view(params.robot, facing(track), observation), track)
+
+
+def _init_from(
+    spec: ControllerSpec, tables: Tables, view: View, track: Array | None = None
+) -> ControllerState:
+    """``Controller.init_from``."""
+    params = tables.params
+    zero = jnp.zeros_like(params.position_slack)
+    state = ControllerState(
+        time=zero,
+        clock=gait.start(params.gaits[0], zero - spec.control_dt),  # first plan: phase 0
+        stance=jnp.ones((4,), bool),
+        lag=zero,
+        command=jnp.zeros((len(COMMAND_NAMES),), zero.dtype),
+        height=zero,
+        ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
+        velocity=zero,
+        correction=jnp.zeros((2,), zero.dtype),
+        memory=start_memory(tables.lmpc, spec),
+        force=jnp.zeros((4, 3), zero.dtype),
+        swing=swing.initial_swing(view.feet),
+        feet=view.feet,
+        base_vel=view.base_vel,
+        torque=jnp.zeros((4, 3), zero.dtype),
+        blind_time=zero,
+        contact=contact.initial_contact(zero.dtype),
+        track=track,
+    )
+    # A buffer of its own for every leaf, so that the state may be donated.
+    return jax.tree.map(jnp.copy, state)
+
+
+def _plan(
+    base: Base,
+    plan_from: Callable[..., tuple[ControllerState, PlanInfo]],
+    tables: Tables,
+    state: ControllerState,
+    observation: Observation,
+) -> tuple[ControllerState, PlanInfo]:
+    """``Controller.plan``."""
+    params = tables.params
+    observation = cast(observation, params.position_slack.dtype)
+    valid = is_valid(observation)
+    observation = or_neutral(observation, valid)
+    if state.track is not None:
+        unset = valid & (state.track == 0.0).all()
+        state = state._replace(track=jnp.where(unset, base.track(observation), state.track))
+    view = base.view(params.robot, facing(state.track), observation)
+    return plan_from(tables, state, view, observation.contact, valid)
+
+
+def _plan_from(
+    spec: ControllerSpec,
+    plan_forces: Planner,
+    tables: Tables,
+    state: ControllerState,
+    view: View,
+    flags: Array,
+    valid: Array,
+) -> tuple[ControllerState, PlanInfo]:
+    """``Controller.plan_from``: clock, swing legs, ground, reference, forces."""
+    params, control_dt = tables.params, spec.control_dt
+    clock = next_clock(params, state, control_dt)
+    where = (clock.gait, clock.phase)
+    stance, mode = params.schedule.stance[where], params.schedule.mode[where]
+    feet = jnp.where(valid, view.feet, state.feet)
+    swings = _next_swings(params, state, clock, stance, flags, feet)
+    heights = feet[:, -1] - params.robot.foot_radius
+    ground = _mean_height(heights, stance, state.ground)
+    wanted = next_reference(params, state, clock, view.planar, control_dt)
+    task = ForceTask(
+        clock=clock,
+        stance=stance,
+        body=_above_ground(view.planar, ground),
+        valid=valid,
+        lag=wanted.lag,
+        velocity=wanted.velocity + wanted.correction[0],
+        command=wanted.command[0] + wanted.correction[0],
+        height=params.height[clock.gait] + wanted.height,
+        pitch_offset=wanted.correction[1],
+        memory=state.memory,
+    )
+    solved = plan_forces(tables, task)
+    next_state = state._replace(
+        time=state.time + control_dt,
+        clock=clock,
+        stance=stance,
+        lag=jnp.where(valid, wanted.lag, state.lag),
+        command=wanted.command,
+        height=wanted.height,
+        ground=jnp.where(valid, ground, state.ground),
+        velocity=wanted.velocity,
+        correction=jnp.where(valid, wanted.correction, state.correction),
+        memory=solved.memory,
+        force=to_local(view, solved.force),
+        swing=swings,
+        feet=feet,
+    )
+    info = PlanInfo(
+        status=jnp.where(valid, solved.status, qp.Status.NON_FINITE).astype(jnp.int32),
+        residual=jnp.where(valid, solved.residual, jnp.inf),
+        iterations=solved.iterations,
+        mode=mode,
+        x=_above_ground(view.planar, ground).x,
+        reference=solved.reference,
+        contact_fault=contact.is_faulty(state.contact),
+        command_ignored=(wanted.command[IGNORED] != 0.0).any(),
+        blind_time=jnp.where(valid, 0.0, state.blind_time + spec.act_dt),
+    )
+    return next_state, info
 
 
 def _next_swings(
@@ -319,10 +268,3 @@ def _above_ground(body: PlanarState, ground: Array) -> PlanarState:
     return body._replace(
         x=body.x.at[:2].add(-origin), base=body.base - origin, feet=body.feet - origin
     )
-
-
-def _facing(track: Array | None) -> Array | None:
-    """The heading to keep, straight ahead where it is not known yet."""
-    if track is None:
-        return None
-    return jnp.where((track == 0.0).all(), jnp.array([1.0, 0.0], track.dtype), track)
