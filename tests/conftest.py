@@ -214,7 +214,7 @@ def random_qp():
 @pytest.fixture(scope="session")
 def standing_run():
     """Factory of made-up runs that stand still: (config, seconds, **fields) -> Trajectory."""
-    from kjax.sim.episode import Trajectory
+    from kjax.sim.trajectory import Trajectory
 
     def build(config, seconds, **fields):
         count = round(seconds / config.sim.sim_dt)

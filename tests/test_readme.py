@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from kjax.config import SimConfig
+from kjax.config import RunConfig, SimConfig
 from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim.observe import find_addresses
-from kjax.sim.scene import build_model
+from kjax.sim.resolve import build_scene
 
 PAGES = ("README.md", *(f"docs/{name}.md" for name in (
     "results", "your_own_loop", "gaits", "sweeps", "qp", "models", "tuning",
@@ -42,7 +42,7 @@ def test_the_controller_examples_walk_somebody_elses_robot(repository):
     with_loop, command, bare = blocks(repository, "docs/your_own_loop.md", "python")
     assert blocks(repository, "README.md", "python") == [with_loop]
     floor = -0.27
-    model = build_model(go1.ROBOT, SimConfig(floor=floor))
+    model = build_scene(RunConfig(sim=SimConfig(floor=floor)))
     at = find_addresses(go1.ROBOT, model)
     data = mujoco.MjData(model)
     height, joints = stand_pose(go1.PARAMS, 0.27)

@@ -15,7 +15,8 @@ from kjax.runs.cache import Cache
 from kjax.runs.pool import Record
 from kjax.sim.engines.contract import Torques
 from kjax.sim.engines.mujoco_batch import BatchEngine
-from kjax.sim.episode import Trajectory
+from kjax.sim.resolve import batch_spec, resolve_episodes
+from kjax.sim.trajectory import Trajectory
 
 Measure = Callable[[Trajectory, RunConfig], dict[str, Any]]
 
@@ -78,10 +79,11 @@ def run_batch(
         for first in range(0, len(missing), max(size, 1)):
             some = missing[first : first + size]
             if engine is None:
-                engine = BatchEngine(configs[0], torques=torques, threads=threads, dtype=dtype)
+                spec = batch_spec(configs[0])
+                engine = BatchEngine(spec, torques=torques, threads=threads, dtype=dtype)
             # All chunks have one number of robots, so that one compilation serves them.
             padded = [configs[number] for number in [*some, *[some[-1]] * (size - len(some))]]
-            recording = engine.run(padded)
+            recording = engine.run(resolve_episodes(padded))
             if recording.interrupted:
                 raise KeyboardInterrupt
             for robot, number in enumerate(some):

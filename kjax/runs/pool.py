@@ -22,8 +22,10 @@ from kjax import cli
 from kjax.config import RunConfig
 from kjax.runs.cache import Cache
 from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
-from kjax.sim.episode import Trajectory, metrics
-from kjax.sim.resolve import BatchSpec, batch_spec
+from kjax.sim.episode import BatchSpec
+from kjax.sim.metrics import metrics
+from kjax.sim.resolve import resolve_episode
+from kjax.sim.trajectory import Trajectory
 
 # Called in the worker with each finished run and the file that belongs to it.
 Record = Callable[[Trajectory, Path], None]
@@ -179,13 +181,14 @@ def _episode(
     config: RunConfig, record: Record | None, path: Path, on_tick: OnTick | None = None
 ) -> dict[str, Any]:
     """Run one episode, on an engine that is kept for those to come."""
-    spec = batch_spec(config)
+    episode = resolve_episode(config)
+    spec = episode.spec
     if spec not in _engines:
         while len(_engines) >= _KEPT:
             del _engines[next(iter(_engines))]
-        _engines[spec] = MujocoEngine(config)
-    run = simulate(_engines[spec], config, on_tick=on_tick)
+        _engines[spec] = MujocoEngine(spec)
+    run = simulate(_engines[spec], episode, on_tick=on_tick)
     if record is not None and not run.interrupted:
         path.parent.mkdir(parents=True, exist_ok=True)
         record(run, path)
-    return metrics(run, config)
+    return metrics(run, episode.goal)

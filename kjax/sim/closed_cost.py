@@ -3,7 +3,7 @@
 import numpy as np
 
 from kjax.robots import get_robot
-from kjax.sim.episode import reference_height
+from kjax.sim.metrics import reference_height
 from kjax.sim.recording import Recording
 from kjax.tuning.loop import CostWeights, Trace, cost
 
@@ -19,8 +19,8 @@ def recording_costs(
     """
     log, ticks = recording.log, len(recording.qpos)
     out = []
-    for robot, config in enumerate(recording.configs):
-        height = reference_height(log.gait[:, robot], recording.dt * np.arange(ticks), config)
+    for robot, episode in enumerate(recording.episodes):
+        height = reference_height(log.gait[:, robot], recording.dt * np.arange(ticks), episode.goal)
         force = np.asarray(log.force[:, robot])[..., ::2]
         trace = Trace(
             x=log.x[:, robot],
@@ -33,5 +33,5 @@ def recording_costs(
             status=log.status[:, robot],
             alive=np.arange(ticks) < recording.ticks[robot] - recording.fell[robot],
         )
-        out.append(float(cost(get_robot(config.robot).params, trace, weights)))
+        out.append(float(cost(get_robot(episode.goal.scene.robot).params, trace, weights)))
     return np.array(out)

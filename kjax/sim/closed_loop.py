@@ -19,12 +19,15 @@ from kjax.controllers.params import Tables
 from kjax.controllers.state import ControllerState
 from kjax.legs.base import build_base
 from kjax.robots import Robot
-from kjax.sim.episode import FALL_HEIGHT, FALL_TILT
+from kjax.sim.episode import BatchSpec, EpisodeParams, SceneSpec
 from kjax.sim.excitation import perturb
 from kjax.sim.noise import add_noise, force_row, sensor_row
 from kjax.sim.observe import build_observe, find_addresses
-from kjax.sim.resolve import BatchSpec, EpisodeParams, SceneSpec
 from kjax.types import Observation, RobotParams
+
+# Height of the centre of mass over the leg's length; about the trunk lying on the ground.
+FALL_HEIGHT = 0.28
+FALL_TILT = 1.0  # rad, pitch or roll
 
 
 class Sensed(NamedTuple):
@@ -210,7 +213,7 @@ def delayed_torque(ring: Any, torque: Any, place: Any, delay: Any) -> tuple[Any,
 
 
 def standing(robot: RobotParams, x: Float[Array, "6"], observation: Observation) -> Bool[Array, ""]:
-    """Whether the robot has not fallen; not a number is a fall ."""
+    """Whether the robot has not fallen; not a number is a fall."""
     w, i, j, k = observation.base_quat
     roll = jnp.arctan2(2.0 * (w * i + j * k), 1.0 - 2.0 * (i * i + j * j))
     finite = jnp.isfinite(observation.joint_pos).all() & jnp.isfinite(observation.joint_vel).all()

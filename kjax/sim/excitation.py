@@ -7,23 +7,7 @@ planned it.
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
-
-from kjax.config import NoiseConfig, RunConfig
-from kjax.sim.noise import force_rows
-
-
-def force_deviation(noise: NoiseConfig) -> float:
-    """Standard deviation of the added forces [N], 0 where noise is off."""
-    return noise.force * noise.enabled
-
-
-def force_noise(config: RunConfig, ticks: int) -> Float[np.ndarray, "ticks 4"]:
-    """Forces [N] that an episode adds at its control ticks."""
-    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    rows = force_rows(config.seed, np.arange(ticks) * per_tick)
-    return rows * np.float32(force_deviation(config.noise))
 
 
 def perturb(

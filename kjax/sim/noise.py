@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from kjax.config import NoiseConfig, RunConfig
+from kjax.sim.episode import EpisodeParams
 from kjax.types import Observation
 
 NOISE_DIM = 30  # planar: x, z, pitch; their rates; 12 joint angles; 12 joint rates
@@ -22,23 +22,6 @@ FREE_NOISE_DIM = 36  # the same, then: y, roll, yaw; their rates
 def noise_dim(base: str) -> int:
     """Length of the noise vector of a base."""
     return FREE_NOISE_DIM if base == "free" else NOISE_DIM
-
-
-def noise_scale(config: NoiseConfig, base: str = "planar") -> Float[np.ndarray, "noise"]:
-    """Standard deviation of each entry of the noise vector (zero where noise is off)."""
-    scale = np.concatenate(
-        [
-            [config.position, config.position, config.pitch],
-            [config.velocity, config.velocity, config.pitch_rate],
-            np.full(12, config.joint_position),
-            np.full(12, config.joint_velocity),
-        ]
-    )
-    if base == "free":
-        sideways = [config.position, config.pitch, config.pitch]
-        rates = [config.velocity, config.pitch_rate, config.pitch_rate]
-        scale = np.concatenate([scale, sideways, rates])
-    return scale * config.enabled
 
 
 # Streams: of the planar base's sensors, of what a free base has besides, of forces.
@@ -67,18 +50,19 @@ _sensor_rows = jax.jit(jax.vmap(sensor_row, in_axes=(None, 0, None)), static_arg
 _force_rows = jax.jit(jax.vmap(force_row, in_axes=(None, 0)))
 
 
-def sensor_noise(config: RunConfig, steps: int, start: int = 0) -> np.ndarray:
+def sensor_noise(params: EpisodeParams, base: str, steps: int, start: int = 0) -> np.ndarray:
     """Noise (steps, n) of an episode from step ``start`` on; n is 30, or 36 for a free base."""
-    scale = noise_scale(config.noise, config.sim.base).astype(np.float32)
+    scale = np.asarray(params.noise_scale)
     if not scale.any():
         return np.zeros((steps, len(scale)), np.float32)
     numbers = np.arange(start, start + steps, dtype=np.int32)
-    return np.asarray(_sensor_rows(np.int32(config.seed), numbers, config.sim.base)) * scale
+    return np.asarray(_sensor_rows(params.seed, numbers, base)) * scale
 
 
-def force_rows(seed: int, steps: np.ndarray) -> np.ndarray:
-    """``force_row`` of many steps, (steps, 4)."""
-    return np.asarray(_force_rows(np.int32(seed), steps.astype(np.int32)))
+def force_noise(params: EpisodeParams, per_tick: int, ticks: int) -> Float[np.ndarray, "ticks 4"]:
+    """Forces [N] that an episode adds at its control ticks, ``per_tick`` physics steps apart."""
+    steps = np.arange(ticks, dtype=np.int32) * np.int32(per_tick)
+    return np.asarray(_force_rows(params.seed, steps)) * np.float32(params.force_noise)
 
 
 def add_noise(observation: Observation, noise: Float[Array, "noise"]) -> Observation:

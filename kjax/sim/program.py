@@ -10,13 +10,11 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from kjax.config import RunConfig
 from kjax.controllers.params import Tables, condense, with_params
-from kjax.controllers.resolve import build_command, resolve
 from kjax.robots import Robot
 from kjax.sim.closed_loop import LoopState, Noise, Sensed, TickLog, build_closed_loop
+from kjax.sim.episode import Episode
 from kjax.sim.noise import noise_dim
-from kjax.sim.resolve import BatchSpec, resolve_scene
 from kjax.types import Command
 
 
@@ -63,36 +61,26 @@ class Program(NamedTuple):
     unpack_log: Callable[[np.ndarray], TickLog]
 
 
-def requests(config: RunConfig) -> Requests:
-    """What a config asks of the controller."""
-    return Requests(
-        gait_times=np.asarray(config.gait.times),
-        command=build_command(config.command),
-        origin=resolve_scene(config)[1].origin,
-    )
+def requests(episode: Episode) -> Requests:
+    """What an episode asks of the controller."""
+    asked = episode.controller
+    return Requests(asked.gait_times, asked.command, episode.params.origin)
 
 
 def build_program(
-    config: RunConfig,
-    robot: Robot,
-    spec: BatchSpec,
-    model: mujoco.MjModel,
-    *,
-    held: bool,
-    dtype: Any = None,
+    episode: Episode, robot: Robot, model: mujoco.MjModel, *, held: bool, dtype: Any = None
 ) -> Program:
-    """The compiled calls for a config.
+    """The compiled calls for an episode, and for others that differ in what is data.
 
     Args:
-      config: of the controller.
+      episode: whose controller it is.
       robot: who walks.
-      spec: of the config.
       model: of the scene.
       held: whether ``act`` is called once per control tick.
       dtype: floating type; JAX's default if ``None``.
     """
-    scene, (controller, params) = spec.scene, resolve(config, robot.params)
-    tables = condense(controller, params, dtype=dtype)
+    spec, scene = episode.spec, episode.spec.scene
+    tables = condense(spec.controller, episode.controller, dtype=dtype)
     loop = build_closed_loop(robot, spec, model, held=held)
     kind = tables.params.position_slack.dtype
     parts = [model.nq, model.nv, model.nsensordata]
@@ -104,18 +92,7 @@ def build_program(
         return Noise(sensors, force), Sensed(qpos, qvel, sensordata)
 
     def pack(tree: _Carried | TickLog) -> Array:
-        return jnp.concatenate([jnp.ravel(a).astype(kind) for a in jax.tree.leaves(tree)])
-
-    def unpack(flat: Array, like: Any) -> Any:
-        leaves, shape = jax.tree.flatten(like)
-        pieces = jnp.split(flat, np.cumsum([leaf.size for leaf in leaves])[:-1])
-        return jax.tree.unflatten(
-            shape,
-            [
-                piece.reshape(leaf.shape).astype(leaf.dtype)
-                for piece, leaf in zip(pieces, leaves, strict=True)
-            ],
-        )
+        return _pack(tree, kind)
 
     def with_requests(wanted: Requests) -> Tables:
         return with_params(tables, gait_times=wanted.gait_times, command=wanted.command)
@@ -133,16 +110,16 @@ def build_program(
         return pack(begin(sensed, wanted))
 
     def plan(flat: Array, sensed: Array) -> tuple[Array, Array]:
-        carried, log = plan_log(unpack(flat, state_like), sensed)
+        carried, log = plan_log(_unpack(flat, state_like), sensed)
         return pack(carried), pack(log)
 
     def act(flat: Array, sensed: Array) -> tuple[Array, Array]:
-        carried = unpack(flat, state_like)
+        carried = _unpack(flat, state_like)
         state, torque = loop.act(with_requests(carried.requests), carried.loop, *split(sensed))
         return pack(_Carried(state, carried.requests)), torque
 
     example = jax.ShapeDtypeStruct((sum(parts),), kind)
-    wanted = requests(config)
+    wanted = requests(episode)
     state_like = jax.eval_shape(begin, example, wanted)
     _, log_like = jax.eval_shape(plan_log, state_like, example)
     program = Program(
@@ -150,10 +127,28 @@ def build_program(
         init=jax.jit(init),
         plan=jax.jit(plan),
         act=jax.jit(act),
-        unpack_log=lambda flat: jax.device_get(jax.vmap(lambda one: unpack(one, log_like))(flat)),
+        unpack_log=lambda flat: jax.device_get(jax.vmap(lambda one: _unpack(one, log_like))(flat)),
     )
     # Compile here, so that the loop's first tick is like its others; the results are dropped.
     sensed = np.zeros(example.shape)
     state = program.init(sensed, wanted)
     jax.block_until_ready((program.plan(state, sensed), program.act(state, sensed)))
     return program
+
+
+def _pack(tree: Any, kind: Any) -> Array:
+    """All leaves of a tree in one vector."""
+    return jnp.concatenate([jnp.ravel(a).astype(kind) for a in jax.tree.leaves(tree)])
+
+
+def _unpack(flat: Array, like: Any) -> Any:
+    """The tree that ``_pack`` made a vector of; shapes and types as in ``like``."""
+    leaves, shape = jax.tree.flatten(like)
+    pieces = jnp.split(flat, np.cumsum([leaf.size for leaf in leaves])[:-1])
+    return jax.tree.unflatten(
+        shape,
+        [
+            piece.reshape(leaf.shape).astype(leaf.dtype)
+            for piece, leaf in zip(pieces, leaves, strict=True)
+        ],
+    )

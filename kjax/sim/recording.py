@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from kjax.config import RunConfig
 from kjax.sim.closed_loop import TickLog
-from kjax.sim.episode import Trajectory, metrics
+from kjax.sim.episode import Episode
+from kjax.sim.metrics import metrics
+from kjax.sim.trajectory import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +20,7 @@ class Recording:
     Rows after a robot's end mean nothing.
 
     Attributes:
-      configs: of the robots.
+      episodes: of the robots.
       dt: time between two samples [s].
       per_tick: samples of a control tick.
       samples: (B,) number of samples of each robot.
@@ -40,7 +41,7 @@ class Recording:
       interrupted: whether it was stopped before its end.
     """
 
-    configs: Sequence[RunConfig]
+    episodes: Sequence[Episode]
     dt: float
     per_tick: int
     samples: np.ndarray
@@ -95,12 +96,12 @@ class Recording:
 
     def metrics(self) -> Iterator[dict[str, Any]]:
         """Metrics of each robot; from a batch without those of wall time."""
-        for robot, config in enumerate(self.configs):
-            yield metrics(self.trajectory(robot), config)
+        for robot, episode in enumerate(self.episodes):
+            yield metrics(self.trajectory(robot), episode.goal)
 
 
 def recording_of_ticks(
-    configs: Sequence[RunConfig],
+    episodes: Sequence[Episode],
     dt: float,
     *,
     ticks: np.ndarray,
@@ -115,7 +116,7 @@ def recording_of_ticks(
     """A batch's recording, sampled at the beginning of each control tick of ``dt``."""
     none = np.zeros((0, len(ticks)))
     return Recording(
-        configs=list(configs),
+        episodes=list(episodes),
         dt=dt,
         per_tick=1,
         samples=ticks,
@@ -159,7 +160,7 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
     series = ("qpos", "qvel", "torque", "x", "feet", "foot_force")
     per_call = ("body_contact", "plan_time", "act_time")
     return Recording(
-        configs=[config for one in recordings for config in one.configs],
+        episodes=[episode for one in recordings for episode in one.episodes],
         dt=first.dt,
         per_tick=first.per_tick,
         samples=whole("samples"),

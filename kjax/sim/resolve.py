@@ -1,107 +1,84 @@
-"""From a config to the world that a robot walks in: its spec (static) and its parameters (data).
-
-Two configs may share a compiled batch if their ``batch_spec`` is the same: what is not in there
-(weights, bounds, timing, terrain, command, pushes, noise, friction, ...) travels as arrays with a
-leading axis B.
-"""
+"""From a config to episodes: the only module of ``kjax.sim`` that reads configs."""
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import fields, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
+import mujoco
 import numpy as np
 
-from kjax.config import (
-    RunConfig,
-)
-from kjax.controllers.params import Tables, condense
+from kjax.config import NoiseConfig, PushConfig, RunConfig
+from kjax.config.gaits import gait_setting
+from kjax.config.units import in_si
+from kjax.controllers.params import ControllerParams
 from kjax.controllers.resolve import build_command, controller_key, controller_spec, resolve
-from kjax.sim.episode import origin
-from kjax.sim.excitation import force_deviation
-from kjax.sim.noise import noise_scale
-from kjax.sim.push import impulses
+from kjax.controllers.walkable import build_gaits
+from kjax.files import file_hashes
+from kjax.legs.posture import stand_pose
+from kjax.robots import get_robot
+from kjax.sim import free_base
+from kjax.sim.episode import (
+    BatchSpec,
+    Episode,
+    EpisodeParams,
+    Goal,
+    SceneSpec,
+    Start,
+    World,
+    initial_state,
+)
+from kjax.sim.observe import find_addresses
+from kjax.sim.scene import apply_world, build_model
+from kjax.sim.terrain import Field, generate, ground_level, place_at, track_of
 from kjax.spec import ControllerSpec
-from kjax.types import Command
 
 
-class EpisodeParams(NamedTuple):
-    """What a robot meets in an episode; a leading axis (B) makes a batch of them.
-
-    Attributes:
-      seed: of the noise.
-      noise_scale: (n,) standard deviation of each entry of the noise vector.
-      force_noise: standard deviation of what is added to planned forces [N].
-      push_begin: (P,) physics step at which each push begins.
-      push_steps: (P,) number of steps it lasts; 0 for none.
-      push_force: (P, 3) force on the trunk meanwhile, world [N].
-      delay: physics steps from a torque's computation to its effect.
-      origin: (3,) where the robot starts, on the floor, world [m].
-    """
-
-    seed: Any
-    noise_scale: Any
-    force_noise: Any
-    push_begin: Any
-    push_steps: Any
-    push_force: Any
-    delay: Any
-    origin: Any
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneSpec:
-    """What shapes the program of a closed loop besides its controller.
-
-    Attributes:
-      robot: who walks.
-      base: "planar" or "free".
-      sim_dt: physics step [s].
-      cone: of the contact solver.
-      contacts: bodies that touch the ground: "all" or "feet".
-      joint_damping: [N m s/rad].
-      joint_armature: [kg m^2].
-      contact_threshold: foot force above which the contact sensor fires [N].
-      terrain: kind of the terrain.
-      obstacles: their number.
-      noise: whether sensors are noisy.
-      force_noise: whether planned forces are perturbed.
-    """
-
-    robot: str
-    base: str
-    sim_dt: float
-    cone: str
-    contacts: str
-    joint_damping: float
-    joint_armature: float
-    contact_threshold: float
-    terrain: str
-    obstacles: int
-    noise: bool
-    force_noise: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class BatchSpec:
-    """What the robots of one compiled batch have in common."""
-
-    controller: ControllerSpec
-    scene: SceneSpec
-
-
-def resolve_scene(
-    config: RunConfig, *, pushes: int | None = None
-) -> tuple[SceneSpec, EpisodeParams]:
-    """Spec and parameters of the world that a robot walks in.
+def resolve_episode(
+    config: RunConfig, *, seed: int | None = None, terrain_seed: int | None = None
+) -> Episode:
+    """The episode of a config; fits the Koopman models where none of a config like it is at hand.
 
     Args:
       config: of the run.
-      pushes: length of the list of pushes, filled up with none; as many as there are if ``None``.
+      seed: of noise and start, in place of the config's.
+      terrain_seed: of the obstacles, likewise.
+
+    Raises:
+      ValueError: for a config that the robot cannot walk with, naming the key.
     """
+    if seed is not None:
+        config = replace(config, seed=seed)
+    if terrain_seed is not None:
+        config = replace(config, terrain=replace(config.terrain, seed=terrain_seed))
+    spec, params = resolve_scene(config)
+    goal, shared = resolve_goal(config), _controller(config)
+    return Episode(
+        spec=BatchSpec(controller=_controller_spec(config), scene=spec),
+        controller=shared._replace(
+            gait_times=goal.gait_times,  # type: ignore[arg-type]
+            command=goal.command,
+        ),
+        params=params,
+        world=resolve_world(config),
+        start=resolve_start(config),
+        goal=goal,
+    )
+
+
+def resolve_episodes(configs: Sequence[RunConfig]) -> list[Episode]:
+    """The episodes of configs; those that differ in nothing else share their fits."""
+    return [resolve_episode(config) for config in configs]
+
+
+def batch_spec(config: RunConfig) -> BatchSpec:
+    """Spec of a config: those with an equal one may walk in one compiled batch."""
+    return BatchSpec(controller=_controller_spec(config), scene=resolve_scene(config)[0])
+
+
+def resolve_scene(config: RunConfig) -> tuple[SceneSpec, EpisodeParams]:
+    """Spec of the scene that a robot walks in, and what it meets there."""
     sim, terrain, noise, push = config.sim, config.terrain, config.noise, config.push
+    force_noise = noise.force * noise.enabled
     spec = SceneSpec(
         robot=config.robot,
         base=sim.base,
@@ -114,113 +91,151 @@ def resolve_scene(
         terrain=terrain.kind,
         obstacles=terrain.count,
         noise=noise.enabled,
-        force_noise=force_deviation(noise) > 0,
+        force_noise=force_noise > 0,
     )
-    steps = round(push.duration / sim.sim_dt)
-    count = len(push.times) if pushes is None else pushes
-    force, begin, length = (
-        np.zeros((count, 3)),
-        np.zeros(count, np.int32),
-        np.zeros(count, np.int32),
-    )
-    for row, forward, lateral in zip(force, *impulses(push), strict=False):
-        row[:2] = np.array([forward, lateral]) / (steps * sim.sim_dt)
-    begin[: len(push.times)] = [round(time / sim.sim_dt) for time in push.times]
-    length[: len(push.times)] = steps
+    steps, count = round(push.duration / sim.sim_dt), len(push.times)
+    force = np.zeros((count, 3))
+    force[:, :2] = _impulses(push) / (steps * sim.sim_dt)
+    begin = np.array([round(time / sim.sim_dt) for time in push.times], np.int32)
     return spec, EpisodeParams(
         seed=np.int32(config.seed),
         noise_scale=noise_scale(noise, sim.base).astype(np.float32),
-        force_noise=np.float32(force_deviation(noise)),
+        force_noise=np.float32(force_noise),
         push_begin=begin,
-        push_steps=length,
+        push_steps=np.full(count, steps, np.int32),
         push_force=force,
         delay=np.int32(round(sim.delay / sim.sim_dt)),
-        origin=origin(sim),
+        origin=_origin(config),
     )
 
 
-def batch_spec(config: RunConfig) -> BatchSpec:
-    """Spec of a config: those with an equal one may walk in one compiled batch."""
+def resolve_goal(config: RunConfig) -> Goal:
+    """What a config asks for; ``metrics`` measure an episode against it."""
+    si, terrain = in_si(config, get_robot(config.robot).params), config.terrain
+    heights = [gait_setting(si, one.name, "body_height") for one in build_gaits(config)]
+    return Goal(
+        scene=resolve_scene(config)[0],
+        duration=config.duration,
+        command=build_command(config.command),
+        gait_times=np.asarray(config.gait.times, float),
+        heights=np.array(heights, float),
+        field=(terrain.start, terrain.end),
+    )
+
+
+def resolve_field(config: RunConfig) -> Field:
+    """The obstacle field of a config, seen from the robot's start."""
+    terrain = config.terrain
+    return Field(
+        track=track_of(get_robot(config.robot).params),
+        friction=config.sim.friction,
+        **{
+            one.name: getattr(terrain, one.name)
+            for one in fields(Field)
+            if one.name not in ("track", "friction")
+        },
+    )
+
+
+def resolve_world(config: RunConfig) -> World:
+    """The world of a config: obstacles from where the robot starts, floor, friction, payload."""
+    sim, field = config.sim, resolve_field(config)
+    heading = sim.heading if sim.base == "free" else 0.0
+    return World(
+        obstacles=place_at(generate(field), _origin(config), heading),
+        ground=sim.floor + ground_level(field),
+        friction=sim.friction,
+        payload=sim.payload,
+    )
+
+
+def resolve_start(config: RunConfig) -> Start:
+    """The robot, standing, disturbed as the config and its seed say."""
+    robot = get_robot(config.robot).params
+    si = in_si(config, robot)
+    height, joints = stand_pose(robot, float(gait_setting(si, config.gait.names[0], "body_height")))
+    pose, rates = np.zeros(3), np.zeros(3)
+    pose[1] = height
+    spread, noise = config.noise, np.random.default_rng([config.seed, 0])
+    if spread.enabled:
+        pitch = spread.initial_pitch * noise.standard_normal()
+        pose[2] = -pitch
+        # Keep the lower pair of feet on the ground rather than in it.
+        pose[1] += abs(np.sin(pitch)) * robot.hip_pos[0, 0]
+        rates[:2] = spread.initial_velocity * noise.standard_normal(2)
+        rates[2] = -spread.initial_pitch_rate * noise.standard_normal()
+    if config.sim.base == "free":
+        pose, rates = free_base.from_planar(pose, rates)
+        free_base.turn(pose, rates, config.sim.heading)
+        pose[:3] += _origin(config)
+    else:
+        pose[:2] += _origin(config)[::2]
+    return Start(pose=pose, rates=rates, joints=joints)
+
+
+def build_scene(config: RunConfig, *, visual: bool = True) -> mujoco.MjModel:
+    """The compiled model of a config's scene, its obstacles in place."""
+    robot = get_robot(config.robot)
+    model = build_model(robot, resolve_scene(config)[0], visual=visual)
+    apply_world(robot, model, resolve_world(config))
+    return model
+
+
+def start_state(config: RunConfig, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Qpos (nq,) and qvel (nv,) of a config's start, in a model of its robot and base."""
+    return initial_state(
+        resolve_start(config), model, find_addresses(get_robot(config.robot), model)
+    )
+
+
+def noise_scale(noise: NoiseConfig, base: str) -> np.ndarray:
+    """Standard deviation (n,) of each entry of a base's noise vector; zero where noise is off."""
+    scale = np.concatenate(
+        [
+            [noise.position, noise.position, noise.pitch],
+            [noise.velocity, noise.velocity, noise.pitch_rate],
+            np.full(12, noise.joint_position),
+            np.full(12, noise.joint_velocity),
+        ]
+    )
+    if base == "free":
+        sideways = [noise.position, noise.pitch, noise.pitch]
+        rates = [noise.velocity, noise.pitch_rate, noise.pitch_rate]
+        scale = np.concatenate([scale, sideways, rates])
+    return scale * noise.enabled
+
+
+def _impulses(push: PushConfig) -> np.ndarray:
+    """Forward and lateral impulse of every push (P, 2) [N s]."""
+    each = [np.broadcast_to(value, len(push.times)) for value in (push.forward, push.lateral)]
+    return np.stack(each, axis=-1).astype(float)
+
+
+def _origin(config: RunConfig) -> np.ndarray:
+    """Where the robot starts, on the floor (3,), world [m]; recordings are measured from it."""
+    sim = config.sim
+    return np.array([sim.start[0], sim.start[1] if sim.base == "free" else 0.0, sim.floor])
+
+
+def _controller_spec(config: RunConfig) -> ControllerSpec:
     # What a file holds may have changed since.
-    return _batch_spec.__wrapped__(config) if config.koopman.file else _batch_spec(config)
+    return controller_spec(config) if config.koopman.file else _cached_spec(config)
 
 
 @lru_cache(maxsize=8192)
-def _batch_spec(config: RunConfig) -> BatchSpec:
-    return BatchSpec(controller=controller_spec(config), scene=resolve_scene(config)[0])
+def _cached_spec(config: RunConfig) -> ControllerSpec:
+    return controller_spec(config)
 
 
-def stack_episodes(configs: Sequence[RunConfig]) -> EpisodeParams:
-    """Parameters (B, ...) of the episodes; shorter lists of pushes are filled up with none."""
-    count = max(len(config.push.times) for config in configs)
-    episodes = [resolve_scene(config, pushes=count)[1] for config in configs]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *episodes)
+_KEPT = 64  # controllers whose parameters are kept
+_controllers: dict[Hashable, ControllerParams] = {}
 
 
-def push_at(episode: EpisodeParams, step: Any, count: int = 1, xp: Any = np) -> Any:
-    """Mean force (..., 3) on the trunk over ``count`` physics steps from ``step`` on [N]."""
-    first = xp.maximum(episode.push_begin, step)
-    last = xp.minimum(episode.push_begin + episode.push_steps, step + count)
-    part = xp.maximum(last - first, 0) / count
-    return (part[..., None] * episode.push_force).sum(axis=-2)
-
-
-def stack_tables(configs: Sequence[RunConfig], dtype: Any) -> tuple[Tables, Any]:
-    """What the controller's functions take, of a batch, and which leaves have its leading axis.
-
-    Configs that differ in nothing that the parameters come from share one fit; leaves that are the
-    same for all robots stay single. Command and requests of gaits always have the axis.
-
-    Args:
-      configs: of the robots, with one ``batch_spec``.
-      dtype: floating type.
-
-    Returns:
-      The tables, and for each leaf 0 or ``None``: ``vmap``'s ``in_axes``.
-    """
-    built: dict[Hashable, Tables] = {}
-    kinds = [controller_key(config) for config in configs]
-    for kind, config in zip(kinds, configs, strict=True):
-        if kind not in built:
-            spec, params = resolve(config)
-            built[kind] = jax.device_get(condense(spec, params, dtype=dtype))
-    names = list(built)
-    which = np.array([names.index(kind) for kind in kinds])
-    pieces = max(len(config.command.times) for config in configs)
-    requests = max(len(config.gait.times) for config in configs)
-    own: list[tuple[np.ndarray, ...]] = []
-    for kind, config in zip(kinds, configs, strict=True):
-        gaits, command = built[kind].params.gaits, build_command(config.command)
-        own.append(
-            (
-                _filled(command.times, pieces, np.inf).astype(dtype),
-                _filled(command.values, pieces, command.values[-1]).astype(dtype),
-                _filled(config.gait.times, requests, np.inf).astype(dtype),
-                _filled(gaits, requests, gaits[-1]).astype(np.int32),
-            )
-        )
-    times, values, gait_times, gait_names = map(np.stack, zip(*own, strict=True))
-
-    def hollow(tables: Tables, *fields: Any) -> Any:
-        new = dict(zip(("command", "gait_times", "gaits"), fields, strict=True))
-        return tables._replace(params=tables.params._replace(**new))
-
-    def stack(*leaves: Any) -> Any:
-        same = all(np.array_equal(leaf, leaves[0]) for leaf in leaves[1:])
-        return leaves[0] if same else np.stack(leaves)[which]
-
-    shared = [hollow(tables, 0, 0, 0) for tables in built.values()]
-    axes = jax.tree.map(
-        lambda *leaves: None if np.ndim(stack(*leaves)) == np.ndim(leaves[0]) else 0, *shared
-    )
-    commands = Command(times, values)  # type: ignore[arg-type]
-    stacked = hollow(jax.tree.map(stack, *shared), commands, gait_times, gait_names)
-    own_axes = hollow(axes, Command(0, 0), 0, 0)  # type: ignore[arg-type]
-    return jax.tree.map(jnp.asarray, stacked), own_axes
-
-
-def _filled(values: Any, count: int, rest: Any) -> np.ndarray:
-    """Values, filled up to ``count`` of them."""
-    values = np.asarray(values, float)
-    more = np.broadcast_to(np.asarray(rest, float), (count - len(values), *values.shape[1:]))
-    return np.concatenate([values, more])
+def _controller(config: RunConfig) -> ControllerParams:
+    """Parameters of a config's controller, kept for configs that differ elsewhere."""
+    key = (controller_key(config), *file_hashes(config).values())
+    if key not in _controllers:
+        while len(_controllers) >= _KEPT:
+            _controllers.pop(next(iter(_controllers)))
+        _controllers[key] = resolve(config)[1]
+    return _controllers[key]

@@ -6,10 +6,10 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from kjax.config import SimConfig, TerrainConfig
 from kjax.robots import Robot
+from kjax.sim.episode import SceneSpec, World
 from kjax.sim.observe import Addresses, find_addresses
-from kjax.sim.terrain import add_obstacles, generate, ground_level, moved, place
+from kjax.sim.terrain import add_obstacles, place
 
 _CONES = {
     "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
@@ -17,67 +17,60 @@ _CONES = {
 }
 
 
-def build_spec(
-    robot: Robot, config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
-) -> mujoco.MjSpec:
+def build_spec(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoco.MjSpec:
     """MjSpec of a robot on its ground, open to further edits before ``compile``.
+
+    Obstacles, floor, friction and payload are ``apply_world``'s.
 
     Args:
       robot: who stands there.
-      config: physics.
-      terrain: obstacles; none if ``None``.
+      scene: physics, and the number and types of obstacles.
       visual: whether to make it fit to look at; textures are 97 % of the compiled model, which a
         batch holds once per robot.
     """
     spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
-    spec.option.timestep = config.sim_dt
-    spec.option.cone = _CONES[config.cone]
+    spec.option.timestep = scene.sim_dt
+    spec.option.cone = _CONES[scene.cone]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.iterations = 30
     for joint in spec.joints:
-        joint.damping[0] = config.joint_damping
-        joint.armature = config.joint_armature
+        joint.damping[0] = scene.joint_damping
+        joint.armature = scene.joint_armature
     for geom in spec.geoms:
-        if geom.name in robot.feet:
-            geom.friction[0] = config.friction
-        elif config.contacts == "feet":
+        if scene.contacts == "feet" and geom.name not in robot.feet:
             geom.contype, geom.conaffinity = 0, 0
-    _add_base(spec, robot.trunk, config.base)
-    level = 0.0 if terrain is None else ground_level(terrain)
-    _add_ground(spec, config.floor + level, visual)
+    _add_base(spec, robot.trunk, scene.base)
+    _add_ground(spec, visual)
     if visual:
         _add_looks(spec, robot.trunk)
-    if terrain is not None:
-        add_obstacles(spec, terrain, config)
+    add_obstacles(spec, scene.terrain, scene.obstacles)
     return spec
 
 
-def build_model(
-    robot: Robot, config: SimConfig, terrain: TerrainConfig | None = None, *, visual: bool = True
-) -> mujoco.MjModel:
-    """Compiled model of a robot on its ground, flat by default."""
-    return build_spec(robot, config, terrain, visual=visual).compile()
+def build_model(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoco.MjModel:
+    """Compiled model of a robot on its ground; ``apply_world`` puts the obstacles in place."""
+    return build_spec(robot, scene, visual=visual).compile()
 
 
 @lru_cache(maxsize=16)
 def robot_addresses(robot: Robot, base: Literal["planar", "free"]) -> Addresses:
-    """Where recorded positions of a robot on a base hold what, whatever the ground is."""
-    return find_addresses(robot, build_model(robot, SimConfig(base=base), visual=False))
+    """Where recorded positions of a robot on a base hold what, whatever the scene is."""
+    spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
+    _add_base(spec, robot.trunk, base)
+    return find_addresses(robot, spec.compile())
 
 
-def apply_scene(
-    robot: Robot, model: mujoco.MjModel, config: SimConfig, field: TerrainConfig
-) -> None:
-    """Give a compiled scene another config's obstacles, floor, friction and payload, in place.
+def apply_world(robot: Robot, model: mujoco.MjModel, world: World) -> None:
+    """Give a compiled scene its obstacles, floor, friction and payload, in place.
 
     Raises:
       ValueError: for a field with another number of obstacles.
     """
-    model.body_mass[model.body(robot.trunk).id] = robot.params.trunk_mass + config.payload
-    model.geom_friction[[model.geom(name).id for name in robot.feet], 0] = config.friction
-    model.geom_pos[model.geom("ground").id, 2] = config.floor + ground_level(field)
+    model.body_mass[model.body(robot.trunk).id] = robot.params.trunk_mass + world.payload
+    model.geom_friction[[model.geom(name).id for name in robot.feet], 0] = world.friction
+    model.geom_pos[model.geom("ground").id, 2] = world.ground
     # Computes what follows from the mass as well.
-    place(model, moved(generate(field, config.friction), config))
+    place(model, world.obstacles)
 
 
 def _add_base(spec: mujoco.MjSpec, body: str, base: str) -> None:
@@ -96,12 +89,12 @@ def _add_base(spec: mujoco.MjSpec, body: str, base: str) -> None:
         trunk.add_joint(name=name, type=kind, axis=axis, damping=[0, 0, 0], armature=0)
 
 
-def _add_ground(spec: mujoco.MjSpec, floor: float, visual: bool) -> None:
+def _add_ground(spec: mujoco.MjSpec, visual: bool) -> None:
     """The plane that everything stands on."""
     spec.worldbody.add_geom(
         name="ground",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
-        pos=[0, 0, floor],
+        pos=[0, 0, 0],
         size=[0, 0, 0.05],
         contype=1,
         conaffinity=0,

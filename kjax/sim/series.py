@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kjax.sim.episode import Trajectory
+from kjax.sim.trajectory import Trajectory
 
 PERIOD = 0.005  # s between two samples, a control tick by default
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from kjax.config import CommandConfig
-from kjax.sim.episode import SETTLE_TIME
+from kjax.sim.metrics import SETTLE_TIME
+from kjax.types import Command
 
 # Where a small value is the bad one; of all others the largest magnitude is the worst.
 LOWER_IS_WORSE = {"realtime_factor", "height_min_m", "distance_m", "velocity_late_mean_mps"}
@@ -37,7 +37,7 @@ def summarise(results: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def tracking_floor(
-    command: CommandConfig, acceleration: float, *, end: float, start: float = SETTLE_TIME
+    command: Command, acceleration: float, *, end: float, start: float = SETTLE_TIME
 ) -> float:
     """Velocity RMSE that remains if the robot answers every step at a constant acceleration [m/s].
 
@@ -50,10 +50,11 @@ def tracking_floor(
       end: of the measured window [s].
       start: of the measured window [s].
     """
-    times = [*command.times, end]
-    velocity = command.v_x[0]  # the window begins after the first piece has
+    times = [*np.asarray(command.times), end]
+    wanted_speed = np.asarray(command.values)[:, 0]
+    velocity = wanted_speed[0]  # the window begins after the first piece has
     total = 0.0
-    for wanted, begin, until in zip(command.v_x, times[:-1], times[1:], strict=True):
+    for wanted, begin, until in zip(wanted_speed, times[:-1], times[1:], strict=True):
         error = wanted - velocity
         low, high = (_left(abs(error), acceleration, t - begin) for t in (max(begin, start), until))
         if min(until, end) > max(begin, start):

@@ -4,19 +4,50 @@ A kind fixes how many boxes and capsules the scene holds, a seed fixes where the
 compiled once per kind, and ``place`` moves its obstacles.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from kjax.config import SimConfig, TerrainConfig
+from kjax.types import RobotParams
 
 _BOX, _CAPSULE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
 PREFIX = "obstacle_"
-_TRACK = 0.127  # m, half the distance between the left and the right feet
 _WIDE = 0.4  # m, half-width of what reaches across both tracks
 _PLATFORM = 5.0  # m, half-length of what a slope downwards starts from and ends at
 _ACROSS = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # turns a capsule's axis along y
+
+
+@dataclass(frozen=True, kw_only=True)
+class Field:
+    """An obstacle field, measured from where the robot starts.
+
+    Attributes:
+      kind: "flat", "paper", "blocks", "steps", "slope" or "patches", see ``generate``.
+      seed: of where the obstacles lie.
+      count: number of obstacles, steps or patches.
+      start: where the field begins [m].
+      end: where it ends [m].
+      height_min: lowest obstacle, or rise of a step [m].
+      height_max: highest obstacle, or rise of a step [m].
+      slope: inclination of a slope; below 0 it leads down first [deg].
+      patch_friction: sliding friction of a foot on a patch [-].
+      friction: that on all else [-].
+      track: half the distance between the left and the right feet [m].
+    """
+
+    kind: str
+    seed: int
+    count: int
+    start: float
+    end: float
+    height_min: float
+    height_max: float
+    slope: float
+    patch_friction: float
+    friction: float
+    track: float
 
 
 class Terrain(NamedTuple):
@@ -35,29 +66,30 @@ class Terrain(NamedTuple):
     friction: np.ndarray
 
 
-def shapes(config: TerrainConfig) -> list[mujoco.mjtGeom]:
+def track_of(robot: RobotParams) -> float:
+    """Half the distance between the left and the right feet of a standing robot, to 1 mm [m]."""
+    return round(float(abs(robot.hip_pos[1, 1] + robot.abduction_offset[1])), 3)
+
+
+def shapes(kind: str, count: int) -> list[mujoco.mjtGeom]:
     """Geom type of every obstacle of a kind of field; the same for all its seeds."""
-    if config.kind == "flat":
+    if kind == "flat":
         return []
-    if config.kind == "slope":
+    if kind == "slope":
         return [_BOX] * 4
-    if config.kind == "paper":
-        return [_CAPSULE if i % 3 == 2 else _BOX for i in range(config.count)]
-    return [_BOX] * config.count
+    if kind == "paper":
+        return [_CAPSULE if i % 3 == 2 else _BOX for i in range(count)]
+    return [_BOX] * count
 
 
-def generate(config: TerrainConfig, friction: float) -> Terrain:
-    """The field of a config and its seed.
+def generate(field: Field) -> Terrain:
+    """The obstacles of a field, from where the robot starts.
 
     Kinds: ``paper`` (blocks, cubes and capsules in turn, on the left track, the right one or
     both), ``blocks`` (random blocks on both tracks), ``steps`` (a flight of steps up, then down),
     ``slope`` (up, level, down; or down, level, up), ``patches`` (level, slippery plates).
-
-    Args:
-      config: kind, seed, extent and heights.
-      friction: of the ground, for obstacles that are no patches [-].
     """
-    rng = np.random.default_rng([config.seed, 7])
+    rng = np.random.default_rng([field.seed, 7])
     make = {
         "flat": _none,
         "paper": _paper,
@@ -65,39 +97,44 @@ def generate(config: TerrainConfig, friction: float) -> Terrain:
         "steps": _steps,
         "slope": _slope,
         "patches": _patches,
-    }[config.kind]
-    pos, quat, size = make(config, rng)
-    slippery = config.kind == "patches"
-    mu = np.full(len(pos), config.patch_friction if slippery else friction)
+    }[field.kind]
+    pos, quat, size = make(field, rng)
+    slippery = field.kind == "patches"
+    mu = np.full(len(pos), field.patch_friction if slippery else field.friction)
     return Terrain(pos=pos, quat=quat, size=size, friction=mu)
 
 
-def moved(terrain: Terrain, sim: SimConfig) -> Terrain:
-    """The field seen from the robot's start: turned by its heading, on its floor."""
-    turn = sim.heading if sim.base == "free" else 0.0
-    c, s = np.cos(turn), np.sin(turn)
+def place_at(terrain: Terrain, start: np.ndarray, heading: float) -> Terrain:
+    """Obstacles given from the robot's start, in the world.
+
+    Args:
+      terrain: from where the robot starts, along its heading.
+      start: (3,) the start, on the floor, world [m].
+      heading: of the robot there [rad].
+    """
+    c, s = np.cos(heading), np.sin(heading)
     pos = terrain.pos @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     w, x, y, z = terrain.quat.T
-    h_c, h_s = np.cos(turn / 2), np.sin(turn / 2)
+    h_c, h_s = np.cos(heading / 2), np.sin(heading / 2)
     quat = np.stack(
         [h_c * w - h_s * z, h_c * x - h_s * y, h_c * y + h_s * x, h_c * z + h_s * w], axis=-1
     )
-    start = [sim.start[0], sim.start[1] if sim.base == "free" else 0.0, sim.floor]
     return terrain._replace(pos=pos + start, quat=quat)
 
 
-def add_obstacles(spec: mujoco.MjSpec, config: TerrainConfig, sim: SimConfig) -> None:
-    """Add a field's obstacles to a scene that is not compiled yet."""
-    terrain = moved(generate(config, sim.friction), sim)
-    for i, shape in enumerate(shapes(config)):
+def add_obstacles(spec: mujoco.MjSpec, kind: str, count: int) -> None:
+    """Add the obstacles of a kind of field to a scene that is not compiled yet.
+
+    They lie out of reach until ``place`` moves them.
+    """
+    for i, shape in enumerate(shapes(kind, count)):
         spec.worldbody.add_geom(
             name=f"{PREFIX}{i}",
             type=shape,
-            pos=terrain.pos[i],
-            quat=terrain.quat[i],
-            size=terrain.size[i],
-            friction=[terrain.friction[i], 0.02, 0.01],
-            priority=2 if config.kind == "patches" else 0,  # feet have 1 and overrule the ground
+            pos=[0.0, 0.0, -100.0],
+            size=[0.1, 0.1, 0.1],
+            friction=[1.0, 0.02, 0.01],
+            priority=2 if kind == "patches" else 0,  # feet have 1 and overrule the ground
             contype=1,
             conaffinity=0,
             rgba=[0.55, 0.42, 0.30, 1.0],
@@ -123,25 +160,25 @@ def place(model: mujoco.MjModel, terrain: Terrain) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-Field = tuple[np.ndarray, np.ndarray, np.ndarray]
+_Boxes = tuple[np.ndarray, np.ndarray, np.ndarray]  # centres, orientations, sizes
 
 
-def _none(config: TerrainConfig, rng: np.random.Generator) -> Field:
+def _none(field: Field, rng: np.random.Generator) -> _Boxes:
     return np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3))
 
 
-def _paper(config: TerrainConfig, rng: np.random.Generator) -> Field:
+def _paper(field: Field, rng: np.random.Generator) -> _Boxes:
     pos, quat, size = [], [], []
-    for i, x in enumerate(_spread(config, rng)):
-        h = rng.uniform(config.height_min, config.height_max)
+    for i, x in enumerate(_spread(field, rng)):
+        h = rng.uniform(field.height_min, field.height_max)
         side = rng.integers(-1, 2)  # right track, both, left track
         turn = rng.uniform(-1.0, 1.0)
-        y, q = float(side * _TRACK), _ACROSS
+        y, q = float(side * field.track), _ACROSS
         if i % 3 == 0:  # block
             half = [rng.uniform(0.06, 0.12), 0.12 if side else _WIDE, h / 2]
             q = _yaw(0.4 * turn if side else 0.0)
         elif i % 3 == 1:  # cube, always under one track
-            half, y, q = [h / 2] * 3, float((side or 1) * _TRACK), _yaw(0.7 * turn)
+            half, y, q = [h / 2] * 3, float((side or 1) * field.track), _yaw(0.7 * turn)
         else:  # capsule, lying across
             half = [h / 2, 0.15 if side else _WIDE, 0.0]
         pos.append([x, y, h / 2])
@@ -150,41 +187,41 @@ def _paper(config: TerrainConfig, rng: np.random.Generator) -> Field:
     return np.array(pos), np.array(quat), np.array(size)
 
 
-def _blocks(config: TerrainConfig, rng: np.random.Generator) -> Field:
-    x = _spread(config, rng)
-    h = rng.uniform(config.height_min, config.height_max, config.count)
-    side = rng.integers(-1, 2, config.count)
-    length = rng.uniform(0.05, 0.15, config.count)
+def _blocks(field: Field, rng: np.random.Generator) -> _Boxes:
+    x = _spread(field, rng)
+    h = rng.uniform(field.height_min, field.height_max, field.count)
+    side = rng.integers(-1, 2, field.count)
+    length = rng.uniform(0.05, 0.15, field.count)
     size = np.stack([length, np.where(side == 0, _WIDE, 0.12), h / 2], axis=-1)
-    turn = np.where(side == 0, 0.0, rng.uniform(-0.4, 0.4, config.count))
-    pos = np.stack([x, side * _TRACK, h / 2], axis=-1)
+    turn = np.where(side == 0, 0.0, rng.uniform(-0.4, 0.4, field.count))
+    pos = np.stack([x, side * field.track, h / 2], axis=-1)
     return pos, np.array([_yaw(a) for a in turn]), size
 
 
-def _steps(config: TerrainConfig, rng: np.random.Generator) -> Field:
-    count = config.count
-    rise = rng.uniform(config.height_min, config.height_max, count)
+def _steps(field: Field, rng: np.random.Generator) -> _Boxes:
+    count = field.count
+    rise = rng.uniform(field.height_min, field.height_max, count)
     up = (count + 1) // 2
     level = np.cumsum(np.where(np.arange(count) < up, rise, -rise))
     level = np.maximum(level, 0.005)
-    tread = (config.end - config.start) / count
-    x = config.start + tread * (np.arange(count) + 0.5)
+    tread = (field.end - field.start) / count
+    x = field.start + tread * (np.arange(count) + 0.5)
     pos = np.stack([x, np.zeros(count), level / 2], axis=-1)
     size = np.stack([np.full(count, tread / 2), np.full(count, _WIDE), level / 2], axis=-1)
     return pos, np.tile(_yaw(0.0), (count, 1)), size
 
 
-def ground_level(config: TerrainConfig) -> float:
+def ground_level(field: Field) -> float:
     """Height of the plane that the obstacles lie on, from where the robot starts [m]."""
-    if config.kind != "slope" or config.slope > 0:
+    if field.kind != "slope" or field.slope > 0:
         return 0.0
-    return (config.end - config.start) / 3.0 * np.tan(np.radians(config.slope))
+    return (field.end - field.start) / 3.0 * np.tan(np.radians(field.slope))
 
 
-def _slope(config: TerrainConfig, rng: np.random.Generator) -> Field:
+def _slope(field: Field, rng: np.random.Generator) -> _Boxes:
     """Up, level, down; or, with a negative slope, down from a platform and up to another one."""
-    angle = np.radians(config.slope)
-    third = (config.end - config.start) / 3.0
+    angle = np.radians(field.slope)
+    third = (field.end - field.start) / 3.0
     top, thick = third * np.tan(angle), 0.05
     ramp = 0.5 * third / np.cos(angle)
     pos, quat, size = [], [], []
@@ -195,31 +232,31 @@ def _slope(config: TerrainConfig, rng: np.random.Generator) -> Field:
         quat.append([np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0])
         size.append([half, _WIDE, thick])
 
-    first, last = config.start + 0.5 * third, config.end - 0.5 * third
+    first, last = field.start + 0.5 * third, field.end - 0.5 * third
     add(first, top / 2, -angle, ramp)
     add(last, top / 2, angle, ramp)
     if angle > 0:
         add(0.5 * (first + last), top, 0.0, third / 2)
         add(0.5 * (first + last), top - 3 * thick, 0.0, third / 2)  # inside: both kinds have four
     else:
-        add(config.start - _PLATFORM, 0.0, 0.0, _PLATFORM)
-        add(config.end + _PLATFORM, 0.0, 0.0, _PLATFORM)
+        add(field.start - _PLATFORM, 0.0, 0.0, _PLATFORM)
+        add(field.end + _PLATFORM, 0.0, 0.0, _PLATFORM)
     return np.array(pos), np.array(quat), np.array(size)
 
 
-def _patches(config: TerrainConfig, rng: np.random.Generator) -> Field:
-    x = _spread(config, rng)
-    half = 0.4 * (config.end - config.start) / config.count
+def _patches(field: Field, rng: np.random.Generator) -> _Boxes:
+    x = _spread(field, rng)
+    half = 0.4 * (field.end - field.start) / field.count
     thick = 0.001
-    pos = np.stack([x, np.zeros(config.count), np.full(config.count, thick / 2)], axis=-1)
-    size = np.tile([half, _WIDE, thick / 2], (config.count, 1))
-    return pos, np.tile(_yaw(0.0), (config.count, 1)), size
+    pos = np.stack([x, np.zeros(field.count), np.full(field.count, thick / 2)], axis=-1)
+    size = np.tile([half, _WIDE, thick / 2], (field.count, 1))
+    return pos, np.tile(_yaw(0.0), (field.count, 1)), size
 
 
-def _spread(config: TerrainConfig, rng: np.random.Generator) -> np.ndarray:
+def _spread(field: Field, rng: np.random.Generator) -> np.ndarray:
     """Obstacle centres along the path: evenly from start to end, jittered by up to 4 cm."""
-    x = np.linspace(config.start, config.end, config.count)
-    return x + rng.uniform(-0.04, 0.04, config.count)
+    x = np.linspace(field.start, field.end, field.count)
+    return x + rng.uniform(-0.04, 0.04, field.count)
 
 
 def _yaw(angle: float) -> np.ndarray:

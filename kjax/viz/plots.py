@@ -13,8 +13,10 @@ from matplotlib.axes import Axes
 from kjax.config import RunConfig
 from kjax.controllers.walkable import build_gaits
 from kjax.sim import free_base
-from kjax.sim.episode import Trajectory, reference_height
+from kjax.sim.metrics import reference_height
+from kjax.sim.resolve import resolve_goal
 from kjax.sim.series import Series
+from kjax.sim.trajectory import Trajectory
 from kjax.types import JOINT_NAMES, Leg
 
 BLUE, RED, GREY, DARK = "#2b6cb0", "#c53030", "#a0aec0", "#2d3748"
@@ -65,7 +67,9 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
             _legend_above(pitch)
 
         height.plot(t, run.x[:, 1], color=BLUE)
-        height.plot(t, reference_height(run.gait, t, config), ls="--", color=DARK, lw=0.9)
+        height.plot(
+            t, reference_height(run.gait, t, resolve_goal(config)), ls="--", color=DARK, lw=0.9
+        )
         height.set_ylabel("CoM height [m]")
 
         for axis in (velocity, pitch, height):

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
 from kjax.config import RunConfig
+from kjax.sim.resolve import resolve_field
 from kjax.sim.series import Series
 from kjax.sim.terrain import generate, shapes
 from kjax.viz.plots import (
@@ -238,9 +239,10 @@ def _commands(axis: Axes, run: Series) -> None:
 
 def _obstacles(axis: Axes, config: RunConfig) -> None:
     """Side view of the field: boxes turned about y, capsules as circles."""
-    field = generate(config.terrain, config.sim.friction)
+    field = resolve_field(config)
+    terrain = generate(field)
     for kind, pos, quat, size in zip(
-        shapes(config.terrain), field.pos, field.quat, field.size, strict=True
+        shapes(field.kind, field.count), terrain.pos, terrain.quat, terrain.size, strict=True
     ):
         x, z = pos[0], pos[2]
         if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 
 from kjax.config import RunConfig, load_config
 from kjax.robots import get_robot
-from kjax.sim.episode import Trajectory
+from kjax.sim.trajectory import Trajectory
 from kjax.types import Leg
 
 FPS = 25
@@ -57,9 +57,9 @@ def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
     """Draw a run with MuJoCo's renderer, following the robot from its right side."""
     import mujoco
 
-    from kjax.sim.scene import build_model
+    from kjax.sim.resolve import build_scene
 
-    model = build_model(get_robot(config.robot), config.sim, config.terrain)
+    model = build_scene(config)
     data = mujoco.MjData(model)
     renderer = mujoco.Renderer(model, height=SIZE[1], width=SIZE[0])
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
@@ -89,9 +89,7 @@ def stick_video(run: Trajectory, config: RunConfig, path: Path) -> None:
                 x, _ = at(np.array([tick, 0.0]))
                 draw.line([(x, ground), (x - 5, ground + 8)], fill="#a0aec0")
             trunk, legs = sticks(run.qpos[i])
-            for leg, colour in zip(
-                (1, 3, 0, 2), ("#90cdf4", "#9ae6b4", "#c53030", "#dd6b20"), strict=True
-            ):
+            for leg, colour in _FAR_TO_NEAR.items():
                 draw.line([at(p) for p in legs[leg]], fill=colour, width=5)
                 x, y = at(legs[leg, 2])
                 draw.ellipse([x - 8, y - 8, x + 8, y + 8], fill=colour)
@@ -104,10 +102,10 @@ def _build_sticks(config: RunConfig) -> Callable[[np.ndarray], tuple[np.ndarray,
     import mujoco
 
     from kjax.sim.observe import find_addresses
-    from kjax.sim.scene import build_model
+    from kjax.sim.resolve import build_scene
 
     robot = get_robot(config.robot)
-    model = build_model(robot, config.sim, visual=False)
+    model = build_scene(config, visual=False)
     data, at = mujoco.MjData(model), find_addresses(robot, model)
     bodies = [[model.joint(name).bodyid[0] for name in row[1:]] for row in robot.joints]
 

@@ -16,10 +16,15 @@ from kjax.robots import get_robot, robot_names
 from kjax.robots.robot import Robot
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine
-from kjax.sim.episode import metrics
+from kjax.sim.metrics import metrics
 from kjax.sim.observe import find_addresses
-from kjax.sim.resolve import batch_spec
-from kjax.sim.scene import build_model
+from kjax.sim.resolve import (
+    batch_spec,
+    build_scene,
+    resolve_episode,
+    resolve_episodes,
+    resolve_goal,
+)
 from kjax.types import Leg
 
 NAME = "toy_robot:ROBOT"
@@ -44,7 +49,7 @@ def config():
 
 @pytest.fixture(scope="module")
 def model(config):
-    return build_model(ROBOT, config.sim, visual=False)
+    return build_scene(config, visual=False)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +59,7 @@ def at(model):
 
 @pytest.fixture(scope="module")
 def run(config):
-    return simulate(MujocoEngine(config))
+    return simulate(MujocoEngine(batch_spec(config)), resolve_episode(config))
 
 
 def test_its_numbers_are_those_of_its_model(model, at):
@@ -107,7 +112,7 @@ def test_its_joints_are_read_in_our_convention(model, at):
 
 def test_it_trots(run, config):
     """The default gait, gains and bounds scale with it: 25.4 kg on legs of 0.51 m."""
-    result = metrics(run, config)
+    result = metrics(run, resolve_goal(config))
     assert not run.fell
     assert result["velocity_late_rmse_mps"] < 0.03
     assert result["pitch_max_deg"] < 4.0
@@ -125,7 +130,7 @@ def test_planned_forces_carry_its_weight(run):
 
 
 def test_the_batch_engine_walks_it_alike(run, config):
-    recording = BatchEngine(config, dtype=np.float64).run([config])
+    recording = BatchEngine(batch_spec(config), dtype=np.float64).run(resolve_episodes([config]))
     assert not recording.fell.any()
     ticks = slice(0, 60)
     single = run.x[:: round(recording.dt / run.dt)][ticks]
@@ -143,7 +148,7 @@ def test_robots_differ_in_the_spec_of_a_batch(config):
     other = dataclasses.replace(config, robot="go1")
     assert batch_spec(config) != batch_spec(other)
     with pytest.raises(ValueError, match=r"scene\.robot is .go1., the engine.s .toy_"):
-        BatchEngine(config).run([config, other])
+        BatchEngine(batch_spec(config)).run(resolve_episodes([config, other]))
 
 
 @pytest.mark.parametrize(

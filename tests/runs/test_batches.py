@@ -17,16 +17,15 @@ def calls(monkeypatch):
     log = SimpleNamespace(chunks=[], engines=[], stop_at=None)
 
     class Engine:
-        def __init__(self, config, *, torques, threads, dtype):
+        def __init__(self, spec, *, torques, threads, dtype):
             log.engines.append((torques, threads, np.dtype(dtype)))
             self.torques = torques
 
-        def run(self, configs):
+        def run(self, episodes):
             stopped = log.stop_at == len(log.chunks)
-            log.chunks.append([config.seed for config in configs])
-            rows = [
-                {"fell": False, "seed": c.seed, "held": self.torques == "held"} for c in configs
-            ]
+            log.chunks.append([int(one.params.seed) for one in episodes])
+            held = self.torques == "held"
+            rows = [{"fell": False, "seed": int(one.params.seed), "held": held} for one in episodes]
             return SimpleNamespace(
                 interrupted=stopped, metrics=lambda: iter(rows), trajectory=lambda i: rows[i]
             )

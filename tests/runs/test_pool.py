@@ -16,8 +16,8 @@ from kjax.prediction import storage
 from kjax.runs import pool
 from kjax.runs.cache import Cache
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.episode import metrics
-from kjax.sim.resolve import batch_spec
+from kjax.sim.metrics import metrics
+from kjax.sim.resolve import batch_spec, resolve_episode, resolve_goal
 from kjax.types import Mode
 
 SHORT = {
@@ -39,7 +39,7 @@ def config():
 @pytest.fixture(scope="module", autouse=True)
 def simulation(config):
     """Built once; the runner finds it where a worker would have left it."""
-    built = MujocoEngine(config)
+    built = MujocoEngine(batch_spec(config))
     pool._engines.clear()
     pool._engines[batch_spec(config)] = built
     return built
@@ -60,11 +60,11 @@ def test_killed_and_resumed_equals_uninterrupted(config, tmp_path, monkeypatch):
 
     real, started = pool.simulate, []
 
-    def killed(simulation, config, on_tick=None):
+    def killed(simulation, episode, on_tick=None):
         if len(started) == 2:
             raise KeyboardInterrupt
-        started.append(config.seed)
-        return real(simulation, config)
+        started.append(int(episode.params.seed))
+        return real(simulation, episode)
 
     monkeypatch.setattr(pool, "simulate", killed)
     with pytest.raises(KeyboardInterrupt), pool.open_runner(Cache(tmp_path)) as go:
@@ -116,10 +116,10 @@ def test_a_program_is_compiled_anew_from_a_retrained_model(tmp_path, monkeypatch
     built = []
     monkeypatch.setattr("kjax.sim.engines.mujoco.build_program", lambda c, *a, **k: built.append(c))
     config = with_file(retrain(tmp_path / "model.npz", 1e-3))
-    engine = MujocoEngine(config)
+    engine = MujocoEngine(batch_spec(config))
     for value, count in ((1e-3, 1), (2e-3, 2), (2e-3, 2)):
         retrain(tmp_path / "model.npz", value)
-        engine.program(config)
+        engine.program(resolve_episode(config))
         assert len(built) == count
 
 
@@ -174,19 +174,22 @@ def test_one_simulation_serves_other_requests_speeds_frictions_and_pushes(config
             "push.forward": 1.0,
         },
     )
-    shared, own = simulate(simulation, other), simulate(MujocoEngine(other))
+    shared, own = (
+        simulate(simulation, resolve_episode(other)),
+        simulate(MujocoEngine(batch_spec(other)), resolve_episode(other)),
+    )
     assert shared.time[np.argmax(np.diff(shared.gait) != 0)] == pytest.approx(0.399)
     # 1e-9: constants that the compiler folds in one of the two round differently
     np.testing.assert_allclose(shared.qpos, own.qpos, atol=1e-9)
     np.testing.assert_allclose(shared.velocity_command, own.velocity_command, atol=1e-12)
-    first, second = metrics(shared, other), metrics(own, other)
+    first, second = metrics(shared, resolve_goal(other)), metrics(own, resolve_goal(other))
     assert first["fell"] == second["fell"]
 
 
 def test_a_config_that_needs_another_engine_is_refused(config, simulation):
     longer = dataclasses.replace(config, lmpc=dataclasses.replace(config.lmpc, horizon=7))
     with pytest.raises(ValueError, match=r"controller\.horizon is 7, the engine's 6"):
-        simulate(simulation, longer)
+        simulate(simulation, resolve_episode(longer))
 
 
 PARENT = """

@@ -13,10 +13,18 @@ from kjax.robots import go1
 from kjax.sim import free_base
 from kjax.sim.engines import mjx as mjx_engine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.episode import Trajectory, foot_slip, initial_state, metrics
+from kjax.sim.metrics import foot_slip, metrics
 from kjax.sim.noise import FREE_NOISE_DIM, add_noise, sensor_noise
 from kjax.sim.observe import build_observe
-from kjax.sim.scene import build_model
+from kjax.sim.resolve import (
+    batch_spec,
+    build_scene,
+    resolve_episode,
+    resolve_episodes,
+    resolve_scene,
+    start_state,
+)
+from kjax.sim.trajectory import Trajectory
 
 FREE = {"sim.base": "free", "sim.contacts": "feet"}
 PER_TICK, TICKS = 5, 60
@@ -29,8 +37,13 @@ def config():
 
 
 @pytest.fixture(scope="module")
-def simulation(config):
-    return MujocoEngine(config)
+def episode(config):
+    return resolve_episode(config)
+
+
+@pytest.fixture(scope="module")
+def simulation(episode):
+    return MujocoEngine(episode.spec)
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +66,10 @@ def moved(model, seed):
 
 
 def test_it_starts_in_the_planar_robot_s_state(config, model):
-    qpos, qvel = initial_state(config, model)
+    qpos, qvel = start_state(config, model)
     planar = dataclasses.replace(config, sim=dataclasses.replace(config.sim, base="planar"))
-    flat_model = build_model(go1.ROBOT, planar.sim, visual=False)
-    flat, flat_vel = initial_state(planar, flat_model)
+    flat_model = build_scene(planar, visual=False)
+    flat, flat_vel = start_state(planar, flat_model)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = qpos, qvel
     mujoco.mj_forward(model, data)
@@ -69,7 +82,7 @@ def test_it_starts_in_the_planar_robot_s_state(config, model):
     # The lower pair stands on the ground, as on the planar base.
     assert min(feet) == pytest.approx(go1.FOOT_RADIUS, abs=0.002)
     with pytest.raises(ValueError, match="nq 15"):
-        initial_state(config, build_model(go1.ROBOT, SimConfig(base="planar"), visual=False))
+        start_state(config, build_scene(RunConfig(sim=SimConfig(base="planar")), visual=False))
 
 
 def test_the_attitude_is_mujocos(model):
@@ -125,9 +138,10 @@ def test_noise_of_the_trunk_is_three_dimensional(model):
 
 def test_the_sagittal_noise_is_the_planar_robot_s(config):
     planar = dataclasses.replace(config, sim=dataclasses.replace(config.sim, base="planar"))
-    noise = sensor_noise(config, 2000)
+    (_, params), (_, flat) = resolve_scene(config), resolve_scene(planar)
+    noise = sensor_noise(params, "free", 2000)
     assert noise.shape == (2000, FREE_NOISE_DIM)
-    np.testing.assert_array_equal(noise[:, :30], sensor_noise(planar, 2000))
+    np.testing.assert_array_equal(noise[:, :30], sensor_noise(flat, "planar", 2000))
     scale = [0.001, 0.003, 0.003, 0.02, 0.05, 0.05]
     # 6 %: four standard errors of a standard deviation of 2000 samples
     np.testing.assert_allclose(noise[:, 30:].std(axis=0), scale, rtol=0.06)
@@ -153,18 +167,18 @@ def test_metrics_measure_yaw_and_drift_from_the_first_heading():
 
 
 @pytest.fixture(scope="module")
-def shoved(simulation):
+def shoved(simulation, episode):
     """A trot that gets 0.3 m/s to the left at 0.4 s."""
 
     def push(done, total, data):
         if done == 400:
             data.qvel[1] += 0.3
 
-    return simulate(simulation, seed=0, on_tick=push)
+    return simulate(simulation, episode, on_tick=push)
 
 
-def test_it_trots_at_the_commanded_speed_and_takes_a_shove(shoved, simulation):
-    result = metrics(shoved, simulation.config)
+def test_it_trots_at_the_commanded_speed_and_takes_a_shove(shoved, episode):
+    result = metrics(shoved, episode.goal)
     assert not result["fell"]
     assert result["qp_unsolved"] == 0
     assert np.mean(shoved.x[-500:, 3]) == pytest.approx(0.2, abs=0.03)
@@ -202,18 +216,18 @@ def test_the_same_drag_is_the_same_slip_on_both_bases():
 
 
 @pytest.mark.slow
-def test_three_tenths_of_a_second_on_mjx_agree_with_c(simulation, config):
+def test_three_tenths_of_a_second_on_mjx_agree_with_c(config, episode):
     short = dataclasses.replace(config, duration=TICKS * PER_TICK * 1e-3)
-    device = mjx_engine.MjxEngine(short, dtype=np.float64)
-    on_mjx = device.run([short]).trajectory(0)
+    device = mjx_engine.MjxEngine(batch_spec(short), dtype=np.float64)
+    on_mjx = device.run(resolve_episodes([short])).trajectory(0)
 
     def stop(done, total, data):
         if done >= TICKS * PER_TICK:
             raise KeyboardInterrupt
 
-    same = MujocoEngine(config)
+    same = MujocoEngine(episode.spec)
     same.model = device.model
-    in_c = simulate(same, on_tick=stop)
+    in_c = simulate(same, episode, on_tick=stop)
     assert (on_mjx.plan_status == 0).all()
     # 1e-7: equal algorithms in double precision; contacts amplify the order of sums.
     np.testing.assert_allclose(on_mjx.qpos, in_c.qpos[::PER_TICK], atol=1e-7)

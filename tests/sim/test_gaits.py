@@ -5,7 +5,8 @@ import pytest
 
 from kjax.config import RunConfig, load_config
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.episode import metrics
+from kjax.sim.metrics import metrics
+from kjax.sim.resolve import batch_spec, resolve_episode, resolve_goal
 from kjax.types import Leg
 
 WALK = {"duration": 3.0, "command.times": [0.0, 0.5], "command.v_x": [0.0, 0.3]}
@@ -23,8 +24,8 @@ MIRRORED = {"gaits.own.period": 0.8, "gaits.own.offset": [0.0, 0.5, 0.75, 0.25],
 )  # fmt: skip
 def test_a_gait_that_is_data_walks_on_the_free_base(gait, roll, pitch):
     config = load_config(RunConfig, None, WALK | MIRRORED | {"gait.names": [gait]})
-    run = simulate(MujocoEngine(config))
-    found = metrics(run, config)
+    run = simulate(MujocoEngine(batch_spec(config)), resolve_episode(config))
+    found = metrics(run, resolve_goal(config))
     assert not found["fell"]
     assert found["qp_unsolved"] == 0
     assert found["body_contact_fraction"] == 0.0

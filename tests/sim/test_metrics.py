@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, load_config
-from kjax.sim.episode import metric_names, metrics
+from kjax.sim.metrics import metric_names, metrics
+from kjax.sim.resolve import resolve_goal
 
 WALL = {"plan_ms_median", "plan_ms_p99", "act_ms_median", "act_ms_p99", "realtime_factor"}
 SWITCH = {"gait.names": ["trot", "bound"], "gait.times": [0.0, 1.0]}
@@ -27,4 +28,4 @@ def test_the_metrics_of_an_episode_are_those_that_its_config_names(standing_run,
     run = standing_run(config, seconds)
     if len(config.gait.times) > 1:
         run.gait = np.where(run.time < 1.0, 0, 1)
-    assert set(metrics(run, config)) - WALL == metric_names(config)
+    assert set(metrics(run, resolve_goal(config))) - WALL == metric_names(resolve_goal(config))

@@ -3,19 +3,20 @@ import mujoco
 import numpy as np
 import pytest
 
-from kjax.config import NoiseConfig, SimConfig
+from kjax.config import NoiseConfig, RunConfig, SimConfig
 from kjax.legs.kinematics import planar_state
 from kjax.legs.posture import stand_pose
 from kjax.robots import go1
-from kjax.sim.noise import NOISE_DIM, add_noise, noise_scale
+from kjax.sim.noise import NOISE_DIM, add_noise
 from kjax.sim.observe import build_observe, find_addresses
-from kjax.sim.scene import build_model, build_spec
+from kjax.sim.resolve import build_scene, noise_scale, resolve_scene
+from kjax.sim.scene import build_spec
 from kjax.types import JOINT_NAMES, Leg
 
 
 @pytest.fixture(scope="module")
 def model():
-    return build_model(go1.ROBOT, SimConfig(base="planar"))
+    return build_scene(RunConfig(sim=SimConfig(base="planar")))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def test_joints_are_found_by_name_whatever_the_order_of_the_legs(model, data):
 
 
 def test_a_model_without_a_leg_is_refused_by_name():
-    spec = build_spec(go1.ROBOT, SimConfig())
+    spec = build_spec(go1.ROBOT, resolve_scene(RunConfig())[0])
     spec.joint("FL_calf").name = "something"
     spec.actuator("FL_calf").target = "something"
     with pytest.raises(ValueError, match="FL_calf"):
@@ -105,15 +106,15 @@ def test_no_noise_changes_nothing_and_noise_lands_where_it_should(model, data):
 
 
 def test_noise_scale_follows_the_config():
-    assert (noise_scale(NoiseConfig(enabled=False)) == 0.0).all()
+    assert (noise_scale(NoiseConfig(enabled=False), "planar") == 0.0).all()
     scale = noise_scale(NoiseConfig(), "planar")
     assert scale.shape == (NOISE_DIM,)
     assert scale[2] == NoiseConfig().pitch
 
 
 def test_the_same_mjcf_gives_a_free_base_with_the_same_robot():
-    free = build_model(go1.ROBOT, SimConfig(base="free"))
-    planar = build_model(go1.ROBOT, SimConfig(base="planar"))
+    free = build_scene(RunConfig(sim=SimConfig(base="free")))
+    planar = build_scene(RunConfig(sim=SimConfig(base="planar")))
     assert (free.nq, free.nv, free.nu) == (19, 18, 12)
     assert (planar.nq, planar.nv, planar.nu) == (15, 15, 12)
     np.testing.assert_array_equal(free.body_mass, planar.body_mass)
@@ -121,7 +122,7 @@ def test_the_same_mjcf_gives_a_free_base_with_the_same_robot():
 
 
 def test_both_bases_show_the_controller_the_same_robot(model, data):
-    free_model = build_model(go1.ROBOT, SimConfig(base="free"))
+    free_model = build_scene(RunConfig(sim=SimConfig(base="free")))
     free = mujoco.MjData(free_model)
     half = 0.5 * data.qpos[2]
     free.qpos[:7] = [data.qpos[0], 0, data.qpos[1], np.cos(half), 0, np.sin(half), 0]
@@ -134,6 +135,6 @@ def test_both_bases_show_the_controller_the_same_robot(model, data):
 
 
 def test_feet_only_contacts_leave_the_feet_and_nothing_else():
-    model = build_model(go1.ROBOT, SimConfig(contacts="feet"))
+    model = build_scene(RunConfig(sim=SimConfig(contacts="feet")))
     solid = [model.geom(i).name for i in range(model.ngeom) if model.geom_conaffinity[i]]
     assert sorted(solid) == ["FL_foot", "FR_foot", "RL_foot", "RR_foot"]

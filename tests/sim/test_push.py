@@ -8,7 +8,8 @@ from kjax import RunConfig, load_config
 from kjax.config import ConfigError
 from kjax.robots import go1
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.resolve import push_at, resolve_scene
+from kjax.sim.episode import push_at
+from kjax.sim.resolve import batch_spec, resolve_episode, resolve_scene
 
 DT = 0.001
 
@@ -74,8 +75,8 @@ def test_a_push_speeds_the_walking_robot_up_and_it_walks_on():
     chosen |= {"noise.enabled": False}
     calm = load_config(RunConfig, None, chosen)
     pushed = load_config(RunConfig, None, chosen | {"push.times": [0.5], "push.forward": 4.0})
-    simulation = MujocoEngine(calm)
-    runs = [simulate(simulation, config) for config in (calm, pushed)]
+    simulation = MujocoEngine(batch_spec(calm))
+    runs = [simulate(simulation, resolve_episode(config)) for config in (calm, pushed)]
     np.testing.assert_array_equal(runs[0].x[:501], runs[1].x[:501])
     gain = runs[1].x[600, 3] - runs[0].x[600, 3]
     # The stance legs take back some of the impulse while it acts, and its share of 4 N s / 12.7 kg.

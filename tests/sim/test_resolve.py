@@ -10,9 +10,10 @@ from kjax.config import ConfigError, RunConfig, fields, load_config
 from kjax.controllers.params import condense
 from kjax.controllers.resolve import resolve
 from kjax.robots import go1
-from kjax.sim import resolve as scene
+from kjax.sim.batching import stack_tables
 from kjax.sim.closed_loop import Sensed, build_closed_loop
-from kjax.sim.scene import build_model
+from kjax.sim.episode import push_at, stack_params
+from kjax.sim.resolve import batch_spec, build_scene, resolve_episodes, resolve_scene
 
 # Where 0.9 times the default, or the next of a list of words, is no value.
 VALUES = {
@@ -104,29 +105,30 @@ def keys():
 
 def program(config):
     """What ``plan`` and ``act`` compute, as text."""
-    model = build_model(go1.ROBOT, config.sim, visual=False)
-    spec = scene.batch_spec(config)
+    model = build_scene(config, visual=False)
+    spec = batch_spec(config)
     loop = build_closed_loop(go1.ROBOT, spec, model, held=False)
     tables = condense(*resolve(config, go1.PARAMS))
-    episode = jax.tree.map(lambda leaf: leaf[0], scene.stack_episodes([config]))
+    # Pushes are the engine's.
+    params = resolve_scene(config)[1]._replace(push_begin=(), push_steps=(), push_force=())
     sensed = Sensed(np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nsensordata))
 
-    def walk(tables, episode, step, sensed):
-        noise = loop.noise(episode, step)
+    def walk(tables, params, step, sensed):
+        noise = loop.noise(params, step)
         state = loop.init(tables, noise, sensed)
-        state, log = loop.plan(tables, episode.origin, state, noise, sensed)
+        state, log = loop.plan(tables, params.origin, state, noise, sensed)
         return loop.act(tables, state, noise, sensed), log
 
-    return str(jax.make_jaxpr(walk)(tables, episode, np.int32(0), sensed))
+    return str(jax.make_jaxpr(walk)(tables, params, np.int32(0), sensed))
 
 
 def test_every_key_either_makes_another_program_or_none():
     """A new key of the config belongs to the spec, or must not reach the compiled functions."""
-    plain = scene.batch_spec(RunConfig())
+    plain = batch_spec(RunConfig())
     changing = {
         name
         for name, value in keys()
-        if scene.batch_spec(load_config(RunConfig, None, {name: value})) != plain
+        if batch_spec(load_config(RunConfig, None, {name: value})) != plain
     }
     assert changing == STATIC
 
@@ -136,20 +138,20 @@ def test_what_a_batch_may_vary_changes_nothing_in_the_program(base):
     own = {"sim.base": base}
     varied = own | {name: value for name, value in keys() if name not in STATIC}
     config, other = (load_config(RunConfig, None, chosen) for chosen in (own, varied))
-    assert scene.batch_spec(other) == scene.batch_spec(config)
-    assert hash(scene.batch_spec(other)) == hash(scene.batch_spec(config))
+    assert batch_spec(other) == batch_spec(config)
+    assert hash(batch_spec(other)) == hash(batch_spec(config))
     assert program(other) == program(config)
 
 
 def test_nodes_of_a_cycle_make_another_program():
     cycle = {"gait.names": ["bound_multiphase"]}
     specs = [
-        scene.batch_spec(load_config(RunConfig, None, cycle | own))
+        batch_spec(load_config(RunConfig, None, cycle | own))
         for own in ({}, {"multiphase.node_dt": 0.025}, {"multiphase.tolerance": 1e-7})
     ]
     assert len(set(specs)) == 3
     data = {"multiphase.friction": 0.5, "gaits.bound_multiphase.body_height": 0.6573}
-    assert specs[0] == scene.batch_spec(load_config(RunConfig, None, cycle | data))
+    assert specs[0] == batch_spec(load_config(RunConfig, None, cycle | data))
 
 
 def test_pushes_of_a_batch_are_filled_up_with_none():
@@ -157,14 +159,14 @@ def test_pushes_of_a_batch_are_filled_up_with_none():
         load_config(RunConfig, None, {"push.times": times, "push.forward": 3.0})
         for times in ([0.01], [0.02, 0.05], [])
     ]
-    stacked = scene.stack_episodes(configs)
+    stacked = stack_params(resolve_episodes(configs))
     for step in range(300):
         # 3 N s in 0.1 s each, alone or together.
         began = [[0.01], [0.02, 0.05], []]
         wanted = [30.0 * sum(t <= step * 1e-3 + 1e-9 < t + 0.1 for t in ts) for ts in began]
-        np.testing.assert_allclose(scene.push_at(stacked, step)[:, 0], wanted, atol=1e-12)
+        np.testing.assert_allclose(push_at(stacked, step)[:, 0], wanted, atol=1e-12)
     # over a control tick: the mean, so that the impulse stays
-    held = sum(scene.push_at(stacked, step, 5) * 5e-3 for step in range(0, 300, 5))
+    held = sum(push_at(stacked, step, 5) * 5e-3 for step in range(0, 300, 5))
     np.testing.assert_allclose(held[:, 0], [3.0, 6.0, 0.0], rtol=1e-12)
 
 
@@ -177,7 +179,7 @@ def test_parameters_of_a_batch_are_those_of_its_robots():
             {"gait.names": ["trot", "bound"], "gait.times": [0.0, 2.0]},
         )
     ]
-    tables, axes = scene.stack_tables(configs, np.float64)
+    tables, axes = stack_tables(resolve_episodes(configs), np.float64)
     assert axes.params.height == 0
     assert axes.params.swing.kp is None  # alike for all, so held once
     for i, config in enumerate(configs):

@@ -10,8 +10,15 @@ from kjax.config import RunConfig, load_config
 from kjax.sim import free_base
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine
-from kjax.sim.episode import initial_state, metrics
+from kjax.sim.episode import initial_state
+from kjax.sim.metrics import metrics
 from kjax.sim.program import requests
+from kjax.sim.resolve import (
+    batch_spec,
+    resolve_episode,
+    resolve_episodes,
+    resolve_goal,
+)
 
 WALK = {
     "duration": 1.2,
@@ -29,7 +36,7 @@ def test_neither_the_place_nor_the_height_of_the_floor_matters():
         dataclasses.replace(base, sim=dataclasses.replace(base.sim, start=(x, 0.0), floor=z))
         for x, z in PLACES
     ]
-    recording = BatchEngine(base, dtype=np.float64).run(configs)
+    recording = BatchEngine(batch_spec(base), dtype=np.float64).run(resolve_episodes(configs))
     assert not recording.fell.any()
     x = recording.log.x
     for other in range(1, len(PLACES)):
@@ -49,7 +56,7 @@ def test_neither_place_nor_heading_matters_on_the_free_base():
         )
         for yaw, start, floor in starts
     ]
-    recording = BatchEngine(base, dtype=np.float64).run(configs)
+    recording = BatchEngine(batch_spec(base), dtype=np.float64).run(resolve_episodes(configs))
     assert not recording.fell.any()
     for other in (1, 2):
         np.testing.assert_allclose(recording.log.x[:, other], recording.log.x[:, 0], atol=1e-5)
@@ -72,16 +79,24 @@ def test_it_walks_up_and_down_a_slope(slope):
         "leg.swing_height": 0.2347,
     }
     config = load_config(RunConfig, None, keys)
-    result = metrics(simulate(MujocoEngine(config), seed=1), config)
+    result = metrics(
+        simulate(MujocoEngine(batch_spec(config)), resolve_episode(config, seed=1)),
+        resolve_goal(config),
+    )
     assert not result["fell"]
     assert result["crossed"]
     assert result["pitch_max_deg"] < 12.0
 
 
 @pytest.fixture(scope="module")
-def simulation():
+def episode():
     keys = {"command.times": [0.0, 0.5], "command.v_x": [0.0, 0.3], "sim.base": "planar"}
-    return MujocoEngine(load_config(RunConfig, None, keys))
+    return resolve_episode(load_config(RunConfig, None, keys))
+
+
+@pytest.fixture(scope="module")
+def simulation(episode):
+    return MujocoEngine(episode.spec)
 
 
 FAULTS = {
@@ -93,11 +108,11 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_contact_flags_that_lie_do_not_throw_the_robot(simulation, name):
+def test_contact_flags_that_lie_do_not_throw_the_robot(simulation, episode, name):
     """Flags come from the foot forces, which are replaced here; the physics knows the truth."""
-    model, at, config = simulation.model, simulation.addresses, simulation.config
+    model, at = simulation.model, simulation.addresses
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(config, model)
+    data.qpos[:], data.qvel[:] = initial_state(episode.start, model, at)
     mujoco.mj_forward(model, data)
     noise = np.zeros(30)
 
@@ -106,8 +121,8 @@ def test_contact_flags_that_lie_do_not_throw_the_robot(simulation, name):
         seen[at.foot_force] = FAULTS[name](seen[at.foot_force], rng)
         return np.r_[data.qpos, data.qvel, seen, noise]
 
-    program = simulation.program(config)
-    state, pitch = program.init(sense(), requests(config)), []
+    program = simulation.program(episode)
+    state, pitch = program.init(sense(), requests(episode)), []
     for step in range(3000):
         sensed = sense()
         if step % 5 == 0:

@@ -7,7 +7,7 @@ from mujoco import mjx
 
 from kjax import RunConfig, load_config
 from kjax.sim.engines import mjx as mjx_engine
-from kjax.sim.episode import initial_state
+from kjax.sim.resolve import resolve_scene, start_state
 from kjax.sim.sensitivity import build_sensitivity
 
 CONFIG = load_config(
@@ -17,7 +17,7 @@ CONFIG = load_config(
 
 @pytest.fixture(scope="module")
 def model():
-    made = mjx_engine.build_model(CONFIG)
+    made = mjx_engine.build_model(resolve_scene(CONFIG)[0])
     # C's own differences need a solver that has converged.
     made.opt.iterations, made.opt.ls_iterations, made.opt.tolerance = 100, 100, 0.0
     return made
@@ -27,7 +27,7 @@ def model():
 def standing(model):
     """The robot on its feet, legs loaded: (qpos, qvel, ctrl)."""
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(CONFIG, model)
+    data.qpos[:], data.qvel[:] = start_state(CONFIG, model)
     names = [model.actuator(i).name for i in range(model.nu)]
     joints = [model.actuator_trnid[i, 0] for i in range(len(names))]
     goal = data.qpos[[model.jnt_qposadr[j] for j in joints]].copy()
@@ -76,10 +76,10 @@ def test_reverse_mode_is_what_mjx_cannot(model, standing):
 def test_a_model_whose_derivative_would_be_wrong_is_refused(model):
     free = load_config(RunConfig, None, {"sim.contacts": "feet", "sim.base": "free"})
     with pytest.raises(ValueError, match="no free or ball joint"):
-        build_sensitivity(mjx_engine.build_model(free), 1)
+        build_sensitivity(mjx_engine.build_model(resolve_scene(free)[0]), 1)
     with pytest.raises(ValueError, match="steps must be at least 1"):
         build_sensitivity(model, 0)
-    elliptic = mjx_engine.build_model(CONFIG)
+    elliptic = mjx_engine.build_model(resolve_scene(CONFIG)[0])
     elliptic.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     with pytest.raises(ValueError, match="pyramidal"):
         build_sensitivity(elliptic, 1)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from kjax.config import CommandConfig, RunConfig, load_config
+from kjax.controllers.resolve import build_command
 from kjax.sim.summary import summarise, tracking_floor
 
 
 def test_a_step_costs_the_cube_of_its_height_over_three_accelerations():
-    command = CommandConfig(times=(0.0, 2.0), v_x=(0.0, 0.6))
+    command = build_command(CommandConfig(times=(0.0, 2.0), v_x=(0.0, 0.6)))
     floor = tracking_floor(command, 4.0, start=0.5, end=8.0)
     assert floor == pytest.approx(np.sqrt(0.6**3 / 12.0 / 7.5), rel=1e-12)
 
@@ -16,7 +17,7 @@ def test_a_step_costs_the_cube_of_its_height_over_three_accelerations():
 @pytest.mark.parametrize("velocities", [(0.0, 3.0, -1.0), (1.0, 1.0, 2.5), (0.0, 0.1, 0.2)])
 def test_the_floor_equals_the_error_of_a_robot_integrated_in_small_steps(velocities):
     """With steps that follow before the last one is made good, and a window that cuts one."""
-    command = CommandConfig(times=(0.0, 0.3, 0.8), v_x=velocities)
+    command = build_command(CommandConfig(times=(0.0, 0.3, 0.8), v_x=velocities))
     a, end, dt = 2.0, 1.2, 1e-5
     v, errors = velocities[0], []
     for i in range(round(end / dt)):
@@ -36,7 +37,8 @@ def test_the_papers_profiles_have_the_floors_that_were_worked_out_by_hand(
     name, gentle, hard, repository
 ):
     config = load_config(RunConfig, repository / "configs" / f"{name}.toml")
-    floors = [tracking_floor(config.command, a, end=config.duration) for a in (4.0, 0.8 * 9.81)]
+    command = build_command(config.command)
+    floors = [tracking_floor(command, a, end=config.duration) for a in (4.0, 0.8 * 9.81)]
     assert floors == pytest.approx([gentle, hard], abs=5e-4)  # digits given
 
 

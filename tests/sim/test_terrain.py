@@ -1,5 +1,7 @@
 """Obstacle fields: data in ranges, one scene for all seeds, contacts where they should be."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,9 +11,15 @@ from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim import terrain
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.episode import initial_state
 from kjax.sim.observe import find_addresses
-from kjax.sim.scene import build_model
+from kjax.sim.resolve import (
+    build_scene,
+    resolve_episode,
+    resolve_field,
+    resolve_scene,
+    resolve_world,
+)
+from kjax.sim.scene import apply_world, build_spec
 
 KINDS = ("paper", "blocks", "steps", "slope", "patches")
 
@@ -22,11 +30,15 @@ def top(field, shape):
     return field.pos[:, 2] + half
 
 
+def made(**terrain_keys):
+    """The obstacles of a field, from where the robot starts."""
+    return terrain.generate(resolve_field(RunConfig(terrain=TerrainConfig(**terrain_keys))))
+
+
 def test_the_papers_field_has_eight_obstacles_of_5_to_7_cm_on_the_ground():
     for seed in range(50):
-        config = TerrainConfig(kind="paper", seed=seed)
-        field = terrain.generate(config, 0.8)
-        height = top(field, np.array(terrain.shapes(config)))
+        field = made(kind="paper", seed=seed)
+        height = top(field, np.array(terrain.shapes("paper", 8)))
         assert len(field.pos) == 8
         assert ((height >= 0.05) & (height <= 0.07)).all()
         np.testing.assert_allclose(height, 2 * field.pos[:, 2], atol=1e-12)
@@ -35,8 +47,8 @@ def test_the_papers_field_has_eight_obstacles_of_5_to_7_cm_on_the_ground():
 
 
 def test_blocks_cubes_and_capsules_take_turns():
-    field = terrain.generate(TerrainConfig(kind="paper"), 0.8)
-    shapes = terrain.shapes(TerrainConfig(kind="paper"))
+    field = made(kind="paper")
+    shapes = terrain.shapes("paper", 8)
     for i, shape in enumerate(shapes):
         assert (shape == mujoco.mjtGeom.mjGEOM_CAPSULE) == (i % 3 == 2)
         if i % 3 == 1:
@@ -46,7 +58,7 @@ def test_blocks_cubes_and_capsules_take_turns():
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_seed_gives_its_field_again_and_another_seed_another(kind):
     def make(seed):
-        return terrain.generate(TerrainConfig(kind=kind, seed=seed), 0.8)
+        return made(kind=kind, seed=seed)
 
     for a, b in zip(make(3), make(3), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -57,11 +69,23 @@ def test_a_seed_gives_its_field_again_and_another_seed_another(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
     """Same physics: a ball dropped on the moved field does what it does on the compiled one."""
-    first = TerrainConfig(kind=kind, seed=1)
-    second = TerrainConfig(kind=kind, seed=2)
-    placed = build_model(go1.ROBOT, SimConfig(), first)
-    terrain.place(placed, terrain.generate(second, 0.8))
-    compiled = build_model(go1.ROBOT, SimConfig(), second)
+    first, second = (
+        RunConfig(terrain=TerrainConfig(kind=kind, seed=seed), sim=SimConfig(base="planar"))
+        for seed in (1, 2)
+    )
+    placed = build_scene(first)
+    apply_world(go1.ROBOT, placed, resolve_world(second))
+    spec = build_spec(go1.ROBOT, resolve_scene(second)[0])
+    for geom, *values in zip(
+        (geom for geom in spec.geoms if geom.name.startswith(terrain.PREFIX)),
+        *made(kind=kind, seed=2),
+        strict=True,
+    ):
+        geom.pos, geom.quat, geom.size, geom.friction[0] = values
+    for geom in spec.geoms:
+        if geom.name in go1.ROBOT.feet:
+            geom.friction[0] = 0.8
+    compiled = spec.compile()
     for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound"):
         np.testing.assert_allclose(getattr(placed, name), getattr(compiled, name), atol=1e-12)
     np.testing.assert_allclose(placed.geom_aabb, compiled.geom_aabb, atol=1e-12)
@@ -77,14 +101,16 @@ def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
 
 
 def test_a_field_of_another_size_is_refused():
-    model = build_model(go1.ROBOT, SimConfig(base="planar"), TerrainConfig(kind="paper"))
+    model = build_scene(
+        RunConfig(sim=SimConfig(base="planar"), terrain=TerrainConfig(kind="paper"))
+    )
     with pytest.raises(ValueError, match="4 obstacles, the scene holds 8"):
-        terrain.place(model, terrain.generate(TerrainConfig(kind="slope"), 0.8))
+        terrain.place(model, made(kind="slope"))
 
 
 def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
     config = TerrainConfig(kind="slope", slope=10.0)
-    model = build_model(go1.ROBOT, SimConfig(base="planar"), config)
+    model = build_scene(RunConfig(sim=SimConfig(base="planar"), terrain=config))
     data = mujoco.MjData(model)
     data.qpos[1] = 5.0  # the robot out of the way
     mujoco.mj_forward(model, data)
@@ -105,7 +131,7 @@ def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
 
 def test_a_slope_downwards_starts_level_and_comes_up_again():
     config = TerrainConfig(kind="slope", slope=-10.0)
-    model = build_model(go1.ROBOT, SimConfig(base="planar", floor=0.5), config)
+    model = build_scene(RunConfig(sim=SimConfig(base="planar", floor=0.5), terrain=config))
     data = mujoco.MjData(model)
     data.qpos[1] = 5.0  # the robot out of the way
     mujoco.mj_forward(model, data)
@@ -129,7 +155,7 @@ def test_a_slope_downwards_starts_level_and_comes_up_again():
 def test_a_patch_is_slippery_under_a_foot():
     """A foot's priority overrules the ground's friction; a patch overrules the foot's."""
     config = TerrainConfig(kind="patches", patch_friction=0.2, start=0.19, end=0.6, count=1)
-    model = build_model(go1.ROBOT, SimConfig(base="planar"), config)
+    model = build_scene(RunConfig(sim=SimConfig(base="planar"), terrain=config))
     data = mujoco.MjData(model)
     height, joints = stand_pose(go1.PARAMS, 0.27)
     data.qpos[find_addresses(go1.ROBOT, model).qpos] = joints
@@ -160,17 +186,10 @@ def test_heights_follow_the_ground_under_the_stance_feet():
         "sim.base": "planar",
     }
     config = load_config(RunConfig, None, common)
-    simulation = MujocoEngine(config)
-    original = initial_state(config, simulation.model)
-    lifted = original[0].copy()
-    lifted[:2] += 1.0, rise
-
-    def start(config, model):
-        return lifted, original[1]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kjax.sim.engines.mujoco.initial_state", start)
-        run = simulate(simulation)
+    episode = resolve_episode(config)
+    lifted = episode.start._replace(pose=episode.start.pose + np.array([1.0, rise, 0.0]))
+    episode = dataclasses.replace(episode, start=lifted)
+    run = simulate(MujocoEngine(episode.spec), episode)
     assert not run.fell
     # 5 mm: what is left of the droop under the legs' own weight
     assert run.x[-200:, 1].mean() == pytest.approx(0.27 + rise, abs=0.005)

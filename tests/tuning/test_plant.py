@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from kjax.config import SimConfig
+from kjax.config import RunConfig, SimConfig
 from kjax.legs.kinematics import foot_jacobian, foot_position, leg_trig
 from kjax.legs.stance import stance_torque
 from kjax.robots import go1
-from kjax.sim import scene
+from kjax.sim.resolve import build_scene
 from kjax.tuning import plant
 
 PLANT = plant.nominal_plant(go1.PARAMS, 12.7, 0.39)
@@ -58,7 +58,7 @@ def test_forces_that_joints_and_ground_can_give_pass_unchanged():
 
 def test_the_legs_angular_momentum_is_mujocos():
     """Planar Go1, trunk at rest or moving, legs swinging: MuJoCo's less the trunk's own share."""
-    model = scene.build_model(go1.ROBOT, SimConfig())
+    model = build_scene(RunConfig(sim=SimConfig()))
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
     for trial in range(5):

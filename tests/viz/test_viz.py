@@ -7,6 +7,7 @@ import pytest
 from kjax import cli
 from kjax.config import RunConfig, load_config
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.resolve import batch_spec, resolve_episode
 from kjax.viz import plots, video
 
 
@@ -14,7 +15,7 @@ from kjax.viz import plots, video
 def saved(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     config = load_config(RunConfig, None, {"duration": 0.6})
-    run = simulate(MujocoEngine(config))
+    run = simulate(MujocoEngine(batch_spec(config)), resolve_episode(config))
     run.save(folder / "trajectory.npz")
     cli.save_config(folder / "config.toml", config)
     return folder, run, config

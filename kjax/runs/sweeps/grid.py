@@ -15,7 +15,8 @@ import numpy as np
 from kjax.config import AxisConfig, ConfigError, RunConfig, SweepConfig, load_config
 from kjax.controllers.walkable import check_walkable
 from kjax.robots import get_robot
-from kjax.sim.episode import metric_names
+from kjax.sim.metrics import metric_names
+from kjax.sim.resolve import resolve_goal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +96,7 @@ def _check_figure(
             raise ConfigError(
                 f"{file}: figure.{key}: no axis named '{name}', there are {', '.join(dims)}"
             )
-    known = {"success"}.union(*(metric_names(case) for case in cases))
+    known = {"success"}.union(*(metric_names(resolve_goal(case)) for case in cases))
     for name in wish.metrics:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)

@@ -16,7 +16,8 @@ from kjax.runs.cache import Cache, lock
 from kjax.runs.sweeps.dataset import merged, write
 from kjax.runs.sweeps.grid import plan
 from kjax.sim.engines.contract import Engine, get_engine
-from kjax.sim.resolve import BatchSpec, batch_spec
+from kjax.sim.episode import BatchSpec
+from kjax.sim.resolve import batch_spec, resolve_episodes, resolve_scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +83,7 @@ def run_sweep(
     try:
         engine = get_engine(sweep.engine)
         for config in cases.cases:
-            engine.check(config, sweep.torques)
+            engine.check(batch_spec(config), resolve_scene(config)[1], sweep.torques)
     except ValueError as error:
         raise ConfigError(f"{file}: {error}") from None
     chunks = chunks_of(cases.cases, sweep.chunk)
@@ -146,14 +147,14 @@ def _run_chunks(
             chunk = chunks[number]
             spec = batch_spec(chunk.configs[0])
             if spec not in engines:
-                engines[spec] = build_engine(sweep, chunk.configs[0], threads)
+                engines[spec] = build_engine(sweep, spec, threads)
 
             def on_progress(done: int, whole: int, here: int = before, n: int = number) -> None:
                 bar.update(here + round(steps[n] * done / whole) - bar.n)
 
             bar.set_postfix_str(f"chunk {place + 1} of {len(todo)}")
             clock = time.perf_counter()
-            recording = engines[spec].run(chunk.configs, on_progress)
+            recording = engines[spec].run(resolve_episodes(chunk.configs), on_progress)
             if recording.interrupted:
                 raise KeyboardInterrupt
             rows = list(recording.metrics())[: len(chunk.cases)]
@@ -169,12 +170,12 @@ def _run_chunks(
                 )
 
 
-def build_engine(sweep: SweepConfig, config: RunConfig, threads: int | None = None) -> Engine:
+def build_engine(sweep: SweepConfig, spec: BatchSpec, threads: int | None = None) -> Engine:
     """The engine that a sweep asks for."""
     dtype = np.dtype(sweep.precision)
     if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
         raise ValueError("precision = 'float64' needs jax_enable_x64")
-    return get_engine(sweep.engine)(config, torques=sweep.torques, threads=threads, dtype=dtype)
+    return get_engine(sweep.engine)(spec, torques=sweep.torques, threads=threads, dtype=dtype)
 
 
 def _robot_steps(configs: Sequence[RunConfig]) -> int:

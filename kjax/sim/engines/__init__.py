@@ -1,5 +1,5 @@
 """Engines: MuJoCo in C for one robot or for batches, and MJX; one contract.
 
-``engine = Engine(config)``, then ``engine.run(configs, on_progress) -> Recording`` for any configs
-with the engine's ``batch_spec``.
+``engine = Engine(spec)``, then ``engine.run(episodes, on_progress) -> Recording`` for any episodes
+of that spec. ``sim.resolve`` makes both from configs: ``batch_spec``, ``resolve_episode``.
 """

@@ -1,4 +1,4 @@
-"""What every engine takes and returns: configs of one spec, a ``Recording``."""
+"""What every engine takes and returns: episodes of one spec, a ``Recording``."""
 
 import pkgutil
 from collections.abc import Callable, Sequence
@@ -7,10 +7,9 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from kjax.config import RunConfig
 from kjax.lookup import look_up
+from kjax.sim.episode import BatchSpec, Episode, EpisodeParams
 from kjax.sim.recording import Recording
-from kjax.sim.resolve import BatchSpec, batch_spec
 
 Torques = Literal["every_step", "held"]
 # Called from time to time with the robot-ticks (or steps) done and those in all.
@@ -18,38 +17,38 @@ OnProgress = Callable[[int, int], None]
 
 
 class Engine(Protocol):
-    """Closed loops of configs that share a spec.
+    """Closed loops of episodes that share a spec.
 
     Attributes:
-      spec: what all configs have in common.
+      spec: what all episodes have in common.
     """
 
     spec: BatchSpec
 
     def __init__(
         self,
-        config: RunConfig,
+        spec: BatchSpec,
         *,
         torques: Torques = "every_step",
         threads: int | None = None,
         dtype: Any = np.float32,
     ):
-        """An engine for configs like this one.
+        """An engine for episodes of a spec.
 
         Args:
-          config: one of those to come.
+          spec: from ``sim.resolve.batch_spec``.
           torques: computed at every ``leg.act_dt``, or once per control tick and held.
           threads: at most; as many as cores if ``None``.
           dtype: floating type of the controller.
         """
 
-    def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
-        """Closed loops of all configs, each until its end or its fall."""
+    def run(self, episodes: Sequence[Episode], on_progress: OnProgress | None = None) -> Recording:
+        """Closed loops of all episodes, each until its end or its fall."""
         ...
 
     @staticmethod
-    def check(config: RunConfig, torques: Torques) -> None:
-        """Raise a ValueError that says why the engine cannot walk a config, if it cannot."""
+    def check(spec: BatchSpec, params: EpisodeParams, torques: Torques) -> None:
+        """Raise a ValueError that says why the engine cannot walk an episode, if it cannot."""
 
 
 def get_engine(name: str) -> type[Engine]:
@@ -66,46 +65,49 @@ def get_engine(name: str) -> type[Engine]:
     return engine
 
 
-def check_delay(config: RunConfig, torques: Torques) -> None:
+def check_delay(spec: BatchSpec, params: EpisodeParams, torques: Torques) -> None:
     """Refuse a delay that ends between two calls of the controller."""
-    held, delay = torques == "held", config.sim.delay
-    name, tick = (
-        ("lmpc.control_dt", config.lmpc.control_dt) if held else ("leg.act_dt", config.leg.act_dt)
-    )
-    if abs(delay / tick - round(delay / tick)) > 1e-6:
+    held, dt = torques == "held", spec.scene.sim_dt
+    name, unit = ("lmpc.control_dt", spec.per_tick) if held else ("leg.act_dt", spec.per_act)
+    if int(params.delay) % unit:
         raise ValueError(
-            f"with torques = '{torques}' sim.delay must be a multiple of {name} {tick} s, got "
-            f"{delay} s"
+            f"with torques = '{torques}' sim.delay must be a multiple of {name} {unit * dt:g} s, "
+            f"got {int(params.delay) * dt:g} s"
         )
 
 
-def ticks_of(config: RunConfig) -> int:
-    """Control ticks of an episode."""
-    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    return -(-round(config.duration / config.sim.sim_dt) // per_tick)
+def require_torques(torques: str) -> None:
+    """Refuse a name that is no ``Torques``."""
+    if torques not in ("every_step", "held"):
+        raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
 
 
-def require_one_spec(spec: BatchSpec, configs: Sequence[RunConfig]) -> None:
-    """Raise a ValueError that says which config needs another engine, and why."""
-    if not configs:
-        raise ValueError("configs must hold at least one config, got none")
-    for i, config in enumerate(configs):
-        if batch_spec(config) != spec:
+def require_one_spec(spec: BatchSpec, episodes: Sequence[Episode]) -> None:
+    """Raise a ValueError that says which episode needs another engine, and why."""
+    if not episodes:
+        raise ValueError("episodes must hold at least one episode, got none")
+    for i, episode in enumerate(episodes):
+        if not isinstance(episode, Episode):
+            raise TypeError(
+                f"episodes[{i}]: wanted an Episode of kjax.sim.resolve.resolve_episode, got "
+                f"{type(episode).__name__}"
+            )
+        if episode.spec != spec:
             raise ValueError(
-                f"configs[{i}] needs another engine: {_difference(batch_spec(config), spec)}"
+                f"episodes[{i}] needs another engine: {_difference(episode.spec, spec)}"
             )
 
 
-def require_one_batch(spec: BatchSpec, configs: Sequence[RunConfig], torques: Torques) -> None:
-    """The same, of configs that walk at once: they have one duration."""
-    require_one_spec(spec, configs)
-    for i, config in enumerate(configs):
-        if config.duration != configs[0].duration:
+def require_one_batch(spec: BatchSpec, episodes: Sequence[Episode], torques: Torques) -> None:
+    """The same, of episodes that walk at once: they have one duration."""
+    require_one_spec(spec, episodes)
+    for i, episode in enumerate(episodes):
+        if episode.ticks != episodes[0].ticks:
             raise ValueError(
-                f"configs[{i}].duration is {config.duration} s, the first one's "
-                f"{configs[0].duration} s; one batch has one duration"
+                f"episodes[{i}] takes {episode.goal.duration} s, the first one "
+                f"{episodes[0].goal.duration} s; one batch has one duration"
             )
-        check_delay(config, torques)
+        check_delay(spec, episode.params, torques)
 
 
 def _difference(one: BatchSpec, first: BatchSpec) -> str:

@@ -16,23 +16,30 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from kjax.config import RunConfig
 from kjax.controllers.params import Tables
 from kjax.robots import get_robot
+from kjax.sim.batching import stack_tables
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop, delayed_torque
-from kjax.sim.engines.contract import OnProgress, Torques, check_delay, require_one_batch, ticks_of
+from kjax.sim.engines.contract import (
+    OnProgress,
+    Torques,
+    check_delay,
+    require_one_batch,
+    require_torques,
+)
 from kjax.sim.engines.mujoco_batch import scene_models
-from kjax.sim.episode import initial_state
+from kjax.sim.episode import (
+    BatchSpec,
+    Episode,
+    EpisodeParams,
+    SceneSpec,
+    initial_state,
+    push_at,
+    stack_params,
+)
 from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, recording_of_ticks
-from kjax.sim.resolve import (
-    EpisodeParams,
-    batch_spec,
-    push_at,
-    stack_episodes,
-    stack_tables,
-)
 from kjax.sim.scene import build_spec
 
 _PIECE = 50  # control ticks of one compiled call; between two of them Ctrl-C and progress
@@ -56,23 +63,23 @@ class MjxState(NamedTuple):
     step: Array
 
 
-def build_model(config: RunConfig) -> mujoco.MjModel:
+def build_model(scene: SceneSpec) -> mujoco.MjModel:
     """The scene with the options that MJX needs: few solver iterations, feet-only contacts."""
-    _check_scene(config)
-    spec = build_spec(get_robot(config.robot), config.sim, config.terrain, visual=False)
+    _check_scene(scene)
+    spec = build_spec(get_robot(scene.robot), scene, visual=False)
     spec.option.iterations = 6
     spec.option.ls_iterations = 8
     return spec.compile()
 
 
 class MjxEngine:
-    """MJX for batches of configs with one ``batch_spec``; the same calls as ``BatchEngine``.
+    """MJX for batches of episodes with one spec; the same calls as ``BatchEngine``.
 
     Compiles once per number of robots and kind of difference between them. A batch whose number of
     robots is a multiple of the number of local devices is sharded over them.
 
     Attributes:
-      spec: what all configs have in common.
+      spec: what all episodes have in common.
       model: the C model that MJX's was made from.
       torques: see ``engines.mujoco_batch.BatchEngine``.
       traces: how often the program has been traced.
@@ -80,7 +87,7 @@ class MjxEngine:
 
     def __init__(
         self,
-        config: RunConfig,
+        spec: BatchSpec,
         *,
         torques: Torques = "every_step",
         threads: int | None = None,
@@ -90,58 +97,56 @@ class MjxEngine:
         """Scene and functions; nothing is compiled yet.
 
         Args:
-          config: one of those to come.
+          spec: of the episodes to come.
           torques: ``"every_step"`` or ``"held"``.
           threads: of no effect: XLA has its own.
           dtype: floating type of controller and physics; float64 needs ``jax_enable_x64``.
           impl: implementation of MJX, e.g. ``"warp"`` on an NVIDIA GPU; its own choice if ``None``.
         """
-        if torques not in ("every_step", "held"):
-            raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
-        self.spec, self.torques, self.dtype = batch_spec(config), torques, np.dtype(dtype)
-        self.model = build_model(config)
+        require_torques(torques)
+        self.spec, self.torques, self.dtype = spec, torques, np.dtype(dtype)
+        self.model = build_model(spec.scene)
         self.traces = 0
         self._mjx = self._cast(mjx.put_model(self.model, impl=impl))
         self._impl = impl
-        robot = get_robot(config.robot)
-        self._at = find_addresses(robot, self.model)
-        self._loop = build_closed_loop(robot, self.spec, self.model, held=torques == "held")
-        self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-        per_act = round(config.leg.act_dt / config.sim.sim_dt)
+        self._robot = get_robot(spec.scene.robot)
+        self._at = find_addresses(self._robot, self.model)
+        self._loop = build_closed_loop(self._robot, spec, self.model, held=torques == "held")
+        self._per_tick = spec.per_tick
         # Physics steps that share a torque.
-        self._unit = self._per_tick if torques == "held" else per_act
+        self._unit = spec.per_tick if torques == "held" else spec.per_act
         self._calls: dict[Any, tuple[Callable[..., Any], Callable[..., Any]]] = {}
 
-    def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
-        """Closed loops of all configs, each until its end or its fall.
+    def run(self, episodes: Sequence[Episode], on_progress: OnProgress | None = None) -> Recording:
+        """Closed loops of all episodes, each until its end or its fall.
 
         On Ctrl-C what was walked is returned, marked as interrupted.
 
         Raises:
-          ValueError: for a config with another ``batch_spec``, or other durations.
+          ValueError: for an episode with another spec, or other durations.
         """
-        require_one_batch(self.spec, configs, self.torques)
-        tables, axes = stack_tables(configs, self.dtype)
-        models = scene_models(self.model, configs)
-        episode, (own, own_axes) = stack_episodes(configs), self._differences(models)
-        sensed, warm = self._start(configs, models)
-        delays = 1 + int(episode.delay.max()) // self._unit
-        ticks = ticks_of(configs[0])
+        require_one_batch(self.spec, episodes, self.torques)
+        tables, axes = stack_tables(episodes, self.dtype)
+        models = scene_models(self._robot, self.model, episodes)
+        params, (own, own_axes) = stack_params(episodes), self._differences(models)
+        sensed, warm = self._start(episodes, models)
+        delays = 1 + int(params.delay.max()) // self._unit
+        ticks = episodes[0].ticks
         begin_call, walk_call = self._compiled(axes, own_axes, delays)
-        place = _sharding(len(configs))
+        place = _sharding(len(episodes))
         if place:
-            episode, sensed, warm, own = jax.device_put((episode, sensed, warm, own), place)
-            tables = _spread(tables, axes, place)
+            params, sensed, warm = jax.device_put((params, sensed, warm), place)
+            tables, own = _spread(tables, axes, place), _spread(own, own_axes, place)
         begin, pieces, interrupted = time.perf_counter(), [], False
-        state = begin_call(tables, episode, sensed, warm)
+        state = begin_call(tables, params, sensed, warm)
         try:
             for done in range(0, ticks, _PIECE):
                 count = min(_PIECE, ticks - done)
                 # The last piece may be shorter than it is computed: one program for all.
-                state, piece = walk_call(tables, own, episode, state)
+                state, piece = walk_call(tables, own, params, state)
                 pieces.append(jax.device_get(jax.tree.map(lambda a, n=count: a[:n], piece)))
                 if on_progress is not None:
-                    on_progress((done + count) * len(configs), ticks * len(configs))
+                    on_progress((done + count) * len(episodes), ticks * len(episodes))
                 if not pieces[-1].log.alive[-1].any():
                     break
         except KeyboardInterrupt:
@@ -153,7 +158,7 @@ class MjxEngine:
         fell = ~alive[-1]
         legs, sign = self._at.actuator.reshape(-1), self._at.sign.reshape(-1)
         return recording_of_ticks(
-            configs,
+            episodes,
             self.spec.controller.control_dt,
             ticks=np.where(fell, 1 + np.argmin(alive, axis=0), len(alive)),
             fell=fell,
@@ -166,13 +171,13 @@ class MjxEngine:
         )
 
     def _start(
-        self, configs: Sequence[RunConfig], models: Sequence[mujoco.MjModel]
+        self, episodes: Sequence[Episode], models: Sequence[mujoco.MjModel]
     ) -> tuple[Sensed, Array]:
         """What the robots are at first, and the solver's start: by C, which need not compile."""
         rows = []
-        for config, model in zip(configs, models, strict=True):
+        for episode, model in zip(episodes, models, strict=True):
             data = mujoco.MjData(model)
-            data.qpos[:], data.qvel[:] = initial_state(config, model)
+            data.qpos[:], data.qvel[:] = initial_state(episode.start, model, self._at)
             mujoco.mj_forward(model, data)
             rows.append((data.qpos, data.qvel, data.sensordata, data.qacc_warmstart))
         *sensed, warm = (jnp.asarray(np.stack(a), self.dtype) for a in zip(*rows, strict=True))
@@ -180,15 +185,21 @@ class MjxEngine:
 
     def _differences(
         self, models: Sequence[mujoco.MjModel]
-    ) -> tuple[dict[str, Any], dict[str, int]]:
-        """Fields of MJX's model that differ between the robots, stacked."""
-        fields = {}
+    ) -> tuple[dict[str, Any], dict[str, int | None]]:
+        """Fields of MJX's model that are not the scene's: stacked, or single where all agree.
+
+        Returns:
+          The fields, and for each its axis of robots, 0 or ``None``.
+        """
+        own: dict[str, Any] = {}
+        axes: dict[str, int | None] = {}
         for name in _MODEL_FIELDS:
             values = [getattr(model, name) for model in models]
-            if not all(np.array_equal(value, getattr(self.model, name)) for value in values):
-                fields[name] = np.stack(values)
-        cast = {name: jnp.asarray(value, self.dtype) for name, value in fields.items()}
-        return cast, dict.fromkeys(cast, 0)
+            if not all(np.array_equal(value, values[0]) for value in values):
+                own[name], axes[name] = jnp.asarray(np.stack(values), self.dtype), 0
+            elif not np.array_equal(values[0], getattr(self.model, name)):
+                own[name], axes[name] = jnp.asarray(values[0], self.dtype), None
+        return own, axes
 
     def _cast(self, tree: Any) -> Any:
         def leaf(a: Any) -> Any:
@@ -199,25 +210,25 @@ class MjxEngine:
         return jax.tree.map(leaf, tree)
 
     @staticmethod
-    def check(config: RunConfig, torques: Torques) -> None:
-        """Raise a ValueError that says why this engine cannot walk a config, if it cannot."""
-        check_delay(config, torques)
-        _check_scene(config)
+    def check(spec: BatchSpec, params: EpisodeParams, torques: Torques) -> None:
+        """Raise a ValueError that says why this engine cannot walk an episode, if it cannot."""
+        check_delay(spec, params, torques)
+        _check_scene(spec.scene)
 
     def _compiled(
-        self, axes: Any, own_axes: dict[str, int], delays: int
+        self, axes: Any, own_axes: dict[str, int | None], delays: int
     ) -> tuple[Callable[..., Any], Callable[..., Any]]:
         """Jitted functions of a batch: begin, and walk a piece."""
         leaves, tree = jax.tree.flatten(axes, is_leaf=lambda a: a is None)
-        key = (tuple(leaves), tree, tuple(own_axes), delays)
+        key = (tuple(leaves), tree, tuple(own_axes.items()), delays)
         if key not in self._calls:
 
-            def begin(tables: Any, episode: EpisodeParams, sensed: Sensed, warm: Array) -> MjxState:
-                return self._begin(tables, episode, sensed, warm, delays)
+            def begin(tables: Any, params: EpisodeParams, sensed: Sensed, warm: Array) -> MjxState:
+                return self._begin(tables, params, sensed, warm, delays)
 
-            def piece(tables: Any, own: Any, episode: EpisodeParams, state: MjxState) -> Any:
+            def piece(tables: Any, own: Any, params: EpisodeParams, state: MjxState) -> Any:
                 self.traces += 1
-                return self._walk_piece(tables, own, episode, state)
+                return self._walk_piece(tables, own, params, state)
 
             self._calls[key] = (
                 jax.jit(jax.vmap(begin, (axes, 0, 0, 0))),
@@ -226,7 +237,7 @@ class MjxEngine:
         return self._calls[key]
 
     def _begin(
-        self, tables: Tables, episode: EpisodeParams, sensed: Sensed, warm: Array, delays: int
+        self, tables: Tables, params: EpisodeParams, sensed: Sensed, warm: Array, delays: int
     ) -> MjxState:
         data = self._cast(mjx.make_data(self._mjx, **_impl_argument(self._impl)))
         # Through .at[], since a replaced host array has another layout and compiles twice.
@@ -239,20 +250,20 @@ class MjxEngine:
         return MjxState(
             data=data,
             walk=self._loop.init(
-                tables, self._loop.noise(episode, jnp.zeros((), jnp.int32)), _sensed(data)
+                tables, self._loop.noise(params, jnp.zeros((), jnp.int32)), _sensed(data)
             ),
             under_way=jnp.zeros((delays, self.model.nu), self.dtype),
             step=jnp.zeros((), jnp.int32),
         )
 
     def _walk_piece(
-        self, tables: Tables, own: dict[str, Array], episode: EpisodeParams, state: MjxState
+        self, tables: Tables, own: dict[str, Array], params: EpisodeParams, state: MjxState
     ) -> tuple[MjxState, MjxTick]:
         model, loop, unit = self._mjx.replace(**own), self._loop, self._unit
         trunk = self._at.trunk
 
         def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
-            push = push_at(episode, step, xp=jnp).astype(self.dtype)
+            push = push_at(params, step, xp=jnp).astype(self.dtype)
             pushes = jnp.zeros_like(data.xfrc_applied).at[trunk, :3].set(push)
             stepped = mjx.step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
             # A robot that has fallen stays as it is, whatever its numbers have become.
@@ -262,10 +273,8 @@ class MjxEngine:
 
         def act(carry: MjxState, _: None) -> tuple[MjxState, Array]:
             data, robot, under_way, at = carry
-            robot, torque = loop.act(tables, robot, loop.noise(episode, at), _sensed(data))
-            under_way, applied = delayed_torque(
-                under_way, torque, at // unit, episode.delay // unit
-            )
+            robot, torque = loop.act(tables, robot, loop.noise(params, at), _sensed(data))
+            under_way, applied = delayed_torque(under_way, torque, at // unit, params.delay // unit)
 
             def onward(data: Any, i: Array) -> tuple[Any, None]:
                 return physics(data, applied, at + i, robot.alive), None
@@ -278,8 +287,8 @@ class MjxEngine:
 
         def tick(carry: MjxState, _: None) -> tuple[MjxState, MjxTick]:
             data, robot, under_way, at = carry
-            noise = loop.noise(episode, at)
-            robot, log = loop.plan(tables, episode.origin, robot, noise, _sensed(data))
+            noise = loop.noise(params, at)
+            robot, log = loop.plan(tables, params.origin, robot, noise, _sensed(data))
             carry = MjxState(data, robot, under_way, at)
             after, torques = jax.lax.scan(act, carry, None, length=self._per_tick // unit)
             return after, MjxTick(data.qpos, data.qvel, torques[0], log)
@@ -290,15 +299,15 @@ class MjxEngine:
 ENGINE = MjxEngine
 
 
-def _check_scene(config: RunConfig) -> None:
-    if config.sim.contacts != "feet" or config.sim.cone != "pyramidal":
+def _check_scene(scene: SceneSpec) -> None:
+    if scene.contacts != "feet" or scene.cone != "pyramidal":
         raise ValueError(
             "MJX needs sim.contacts = 'feet' and sim.cone = 'pyramidal', got "
-            f"'{config.sim.contacts}' and '{config.sim.cone}'"
+            f"'{scene.contacts}' and '{scene.cone}'"
         )
 
 
-# What ``scene.apply_scene`` may change, with what follows from it.
+# What ``scene.apply_world`` may change, with what follows from it.
 _MODEL_FIELDS = (
     "geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound", "geom_aabb",
     "body_mass", "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0",
@@ -328,7 +337,7 @@ def _sharding(robots: int) -> NamedSharding | None:
     return NamedSharding(mesh, PartitionSpec("robots"))
 
 
-def _spread(tables: Tables, axes: Any, place: NamedSharding) -> Tables:
+def _spread(tables: Any, axes: Any, place: NamedSharding) -> Any:
     """Parameters on all devices, those of single robots on the robot's own."""
     everywhere = NamedSharding(place.mesh, PartitionSpec())
     return jax.tree.map(

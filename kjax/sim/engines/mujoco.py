@@ -10,20 +10,16 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from kjax.config import RunConfig
-from kjax.controllers.resolve import controller_key
-from kjax.files import file_hashes
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import TickLog
-from kjax.sim.engines.contract import OnProgress, Torques, require_one_spec, ticks_of
-from kjax.sim.episode import Trajectory, initial_state, sagittal
-from kjax.sim.excitation import force_deviation, force_noise
-from kjax.sim.noise import noise_dim, sensor_noise
+from kjax.sim.engines.contract import OnProgress, Torques, require_one_spec, require_torques
+from kjax.sim.episode import BatchSpec, Episode, EpisodeParams, initial_state, push_at
+from kjax.sim.noise import force_noise, noise_dim, sensor_noise
 from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.program import Program, build_program, requests
 from kjax.sim.recording import Recording, concatenate
-from kjax.sim.resolve import batch_spec, push_at, resolve_scene
-from kjax.sim.scene import apply_scene, build_model
+from kjax.sim.scene import apply_world, build_model
+from kjax.sim.trajectory import Trajectory, sagittal
 
 # Called once per control tick with the steps done, the steps in all and the data; return value
 # ignored. For progress bars and viewers.
@@ -40,8 +36,8 @@ class MujocoEngine:
     terrain, friction, payload, pushes, delay, place and heading of the start without another one.
 
     Attributes:
-      config: that it was built from.
-      spec: what all configs have in common.
+      spec: what all episodes have in common.
+      torques: see ``engines.contract``.
       robot: who walks.
       model: of the scene.
       addresses: of the robot in it.
@@ -50,43 +46,40 @@ class MujocoEngine:
 
     def __init__(
         self,
-        config: RunConfig,
+        spec: BatchSpec,
         *,
         torques: Torques = "every_step",
         threads: int | None = None,
         dtype: Any = None,
     ):
-        """Scene and program of a config; compiles.
+        """The scene; the controller is compiled by ``program``, or in the first run.
 
         Args:
-          config: one of those to come.
+          spec: of the episodes to come.
           torques: ``"every_step"``, or ``"held"`` for a control tick.
           threads: of no effect: one robot walks at a time.
           dtype: floating type of the controller; JAX's default if ``None``.
         """
-        self.config, self.spec, self.torques = config, batch_spec(config), torques
-        self._dtype = dtype
-        self.robot = get_robot(config.robot)
-        self.model = build_model(self.robot, config.sim, config.terrain)
+        require_torques(torques)
+        self.spec, self.torques, self._dtype = spec, torques, dtype
+        self.robot = get_robot(spec.scene.robot)
+        self.model = build_model(self.robot, spec.scene)
         self.addresses = find_addresses(self.robot, self.model)
-        self.observe = build_observe(self.robot, self.model, config.sim.contact_threshold)
+        self.observe = build_observe(self.robot, self.model, spec.scene.contact_threshold)
         self._programs: dict[Hashable, Program] = {}
-        self.program(config)
-        # The noise's program as well: a Ctrl-C during a compilation can take the process down.
-        sensor_noise(config, _NOISE_TICKS * self._per_tick)
 
-    def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
-        """Closed loops of all configs, one after the other, each until its end or its fall.
+    def run(self, episodes: Sequence[Episode], on_progress: OnProgress | None = None) -> Recording:
+        """Closed loops of all episodes, one after the other, each until its end or its fall.
 
         On Ctrl-C what was walked is returned, marked as interrupted.
 
         Raises:
-          ValueError: for a config with another ``batch_spec``.
+          ValueError: for an episode with another spec.
         """
-        require_one_spec(self.spec, configs)
-        steps = [ticks_of(one) * self._per_tick for one in configs]
+        require_one_spec(self.spec, episodes)
+        steps = [one.ticks * self.spec.per_tick for one in episodes]
         parts: list[Recording] = []
-        for number, config in enumerate(configs):
+        for number, episode in enumerate(episodes):
             before = sum(steps[:number])
 
             def on_tick(done: int, total: int, data: Any, before: int = before) -> None:
@@ -94,7 +87,7 @@ class MujocoEngine:
                     on_progress(before + done, sum(steps))
 
             try:
-                parts.append(self._episode(config, on_tick))
+                parts.append(self._walk(episode, on_tick))
             except KeyboardInterrupt:  # before there was anything of this one to keep
                 if not parts:
                     raise
@@ -104,169 +97,190 @@ class MujocoEngine:
         return concatenate(parts)
 
     @staticmethod
-    def check(config: RunConfig, torques: Torques) -> None:
-        """This engine walks every config."""
+    def check(spec: BatchSpec, params: EpisodeParams, torques: Torques) -> None:
+        """This engine walks every episode."""
 
-    @property
-    def _per_tick(self) -> int:
-        return round(self.spec.controller.control_dt / self.spec.scene.sim_dt)
-
-    def program(self, config: RunConfig) -> Program:
-        """The compiled calls for a config."""
-        key = (controller_key(config), len(config.command.times), *file_hashes(config).values())
+    def program(self, episode: Episode) -> Program:
+        """The compiled calls for an episode."""
+        key = (episode.controller_key, len(episode.controller.command.times))
         if key not in self._programs:
             while len(self._programs) >= _KEPT:
                 del self._programs[next(iter(self._programs))]
             self._programs[key] = build_program(
-                config, self.robot, self.spec, self.model,
-                held=self.torques == "held", dtype=self._dtype,
-            )  # fmt: skip
+                episode, self.robot, self.model, held=self.torques == "held", dtype=self._dtype
+            )
+            # The noise's program as well: a Ctrl-C in a compilation can take the process down.
+            _Inputs(self, episode, mujoco.MjData(self.model)).at(0)
         return self._programs[key]
 
-    def _episode(self, config: RunConfig, on_tick: OnTick | None) -> Recording:
+    def _walk(self, episode: Episode, on_tick: OnTick | None) -> Recording:
         """One closed loop; KeyboardInterrupt if nothing of it is there to keep."""
-        model, at, robot = self.model, self.addresses, self.robot
-        program = self.program(config)
-        apply_scene(robot, model, config.sim, config.terrain)
-        data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = initial_state(config, model)
-        mujoco.mj_forward(model, data)
-        episode = resolve_scene(config)[1]
-
-        per_tick = self._per_tick
-        per_act = round(config.leg.act_dt / config.sim.sim_dt)
-        per_act = per_tick if self.torques == "held" else per_act
-        ticks = ticks_of(config)
-        steps = ticks * per_tick
-        noisy = self.spec.scene.noise
-        sizes = [model.nq, model.nv, model.nsensordata, noise_dim(config.sim.base) * noisy]
-        cuts = np.cumsum(sizes)
-        excited = force_deviation(config.noise) > 0
-        added = force_noise(config, ticks) if excited else np.zeros((ticks, 0))
-        sensed = np.zeros(cuts[-1] + added.shape[1])
-
-        def sense(step: int) -> np.ndarray:
-            sensed[: cuts[0]] = data.qpos
-            sensed[cuts[0] : cuts[1]] = data.qvel
-            sensed[cuts[1] : cuts[2]] = data.sensordata
-            if noisy:
-                sensed[cuts[2] : cuts[3]] = noise[step % piece]
-            return sensed
-
-        qpos, qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
-        torque, foot_force = np.zeros((steps, model.nu)), np.zeros((steps, 4))
-        plan_time, act_time = np.zeros(ticks), np.zeros(steps)
-        body_contact = np.zeros(ticks, bool)
-        is_foot_or_world = model.geom_bodyid == 0
-        is_foot_or_world[at.feet] = True
-        delay = int(episode.delay)
-        push = push_at(episode, np.arange(steps)[:, None])
-        logs: list[np.ndarray] = []
-        # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
-        piece = _NOISE_TICKS * per_tick
-        noise = sensor_noise(config, piece)
-        state = program.init(sense(0), requests(config))
-
-        fell = interrupted = False
-        done = 0
-        begin = time.perf_counter()
+        walk = _Walk(self, episode)
+        steps = episode.ticks * self.spec.per_tick
+        begin, interrupted = time.perf_counter(), False
         try:
-            for tick in _until_ctrl_c(range(ticks)):
-                if tick > 0 and tick % _NOISE_TICKS == 0:
-                    noise = sensor_noise(config, piece, tick * per_tick)
-                sense(tick * per_tick)
-                sensed[cuts[3] :] = added[tick]
-                clock = time.perf_counter()
-                state, log = program.plan(state, sensed)
-                logs.append(np.asarray(log))
-                plan_time[tick] = time.perf_counter() - clock
-                body_contact[tick] = not is_foot_or_world[data.contact.geom].all()
-                if not logs[-1][-1]:  # alive, the last entry
-                    fell = True
+            for tick in _until_ctrl_c(range(episode.ticks)):
+                if not walk.plan(tick):
                     break
-                for i in range(tick * per_tick, (tick + 1) * per_tick):
-                    qpos[i], qvel[i] = data.qpos, data.qvel
-                    foot_force[i] = data.sensordata[at.foot_force]
-                    if i % per_act:
-                        torque[i], act_time[i] = torque[i - 1], act_time[i - 1]
-                    else:
-                        sense(i)
-                        clock = time.perf_counter()
-                        state, command = program.act(state, sensed)
-                        torque[i] = command
-                        act_time[i] = time.perf_counter() - clock
-                    data.ctrl[:] = torque[i - delay] if i >= delay else 0.0
-                    data.xfrc_applied[at.trunk, :3] = push[i]
-                    mujoco.mj_step(model, data)
-                    done = i + 1
+                walk.act_and_step(tick)
                 if on_tick is not None:
-                    on_tick(done, steps, data)
+                    on_tick(walk.done, steps, walk.data)
         except KeyboardInterrupt:
             interrupted = True
         wall = time.perf_counter() - begin
-        if done == 0:
+        if walk.done == 0:
             raise KeyboardInterrupt  # nothing to keep
-
-        x, feet = sagittal(robot.params, self.observe, qpos[:done], qvel[:done], episode.origin)
-        legs = at.sign.reshape(-1) * torque[:done, at.actuator.reshape(-1)]
-        began = len(logs)
-
-        def one(series: np.ndarray) -> np.ndarray:
-            return np.asarray(series)[:, None]
-
-        return Recording(
-            configs=[config],
-            dt=config.sim.sim_dt,
-            per_tick=per_tick,
-            samples=np.array([done]),
-            ticks=np.array([began]),
-            fell=np.array([fell]),
-            qpos=one(qpos[:done]),
-            qvel=one(qvel[:done]),
-            torque=one(legs),
-            x=one(x),
-            feet=one(feet),
-            foot_force=one(foot_force[:done]),
-            log=TickLog(*map(one, program.unpack_log(np.stack(logs)))),
-            body_contact=one(body_contact[:began]),
-            plan_time=one(plan_time[:began]),
-            act_time=one(act_time[:done]),
-            wall_time=wall,
-            interrupted=interrupted,
-        )
+        return walk.recording(wall, interrupted=interrupted)
 
 
 ENGINE = MujocoEngine
 
 
+class _Inputs:
+    """The vector of sensor values that a program takes: qpos, qvel, sensordata, noise, forces."""
+
+    def __init__(self, engine: MujocoEngine, episode: Episode, data: mujoco.MjData):
+        scene, model = engine.spec.scene, engine.model
+        self._params, self._base, self._data = episode.params, scene.base, data
+        self._noisy = scene.noise
+        sizes = [model.nq, model.nv, model.nsensordata, noise_dim(scene.base) * scene.noise]
+        self._cuts = np.cumsum(sizes)
+        per_tick, ticks = engine.spec.per_tick, episode.ticks
+        # Noise is drawn in pieces of one size: one compilation, and no wait before a long run.
+        self._piece = _NOISE_TICKS * per_tick
+        self._noise, self._first = np.zeros((0, 0)), -self._piece
+        self._force = np.zeros((ticks, 0))
+        if scene.force_noise:
+            self._force = force_noise(episode.params, per_tick, ticks)
+        self._values = np.zeros(self._cuts[-1] + self._force.shape[1])
+
+    def at(self, step: int) -> np.ndarray:
+        """Values at a physics step."""
+        values, cuts, data = self._values, self._cuts, self._data
+        values[: cuts[0]] = data.qpos
+        values[cuts[0] : cuts[1]] = data.qvel
+        values[cuts[1] : cuts[2]] = data.sensordata
+        if self._noisy:
+            if step >= self._first + self._piece:
+                self._first = step - step % self._piece
+                self._noise = sensor_noise(self._params, self._base, self._piece, self._first)
+            values[cuts[2] : cuts[3]] = self._noise[step - self._first]
+        return values
+
+    def at_tick(self, tick: int, step: int) -> np.ndarray:
+        """Values at a control tick, which begins with a physics step."""
+        values = self.at(step)
+        values[self._cuts[3] :] = self._force[tick]
+        return values
+
+
+class _Walk:
+    """A robot's episode under way, and its series."""
+
+    def __init__(self, engine: MujocoEngine, episode: Episode):
+        self.engine, self.episode = engine, episode
+        model, spec = engine.model, engine.spec
+        self.program = engine.program(episode)
+        apply_world(engine.robot, model, episode.world)
+        self.data = mujoco.MjData(model)
+        self.data.qpos[:], self.data.qvel[:] = initial_state(episode.start, model, engine.addresses)
+        mujoco.mj_forward(model, self.data)
+        self.inputs = _Inputs(engine, episode, self.data)
+        self.per_tick = spec.per_tick
+        self.per_act = spec.per_tick if engine.torques == "held" else spec.per_act
+        ticks, steps = episode.ticks, episode.ticks * spec.per_tick
+        self.qpos, self.qvel = np.zeros((steps, model.nq)), np.zeros((steps, model.nv))
+        self.torque, self.foot_force = np.zeros((steps, model.nu)), np.zeros((steps, 4))
+        self.plan_time, self.act_time = np.zeros(ticks), np.zeros(steps)
+        self.body_contact = np.zeros(ticks, bool)
+        self.logs: list[np.ndarray] = []
+        self.is_foot_or_world = model.geom_bodyid == 0
+        self.is_foot_or_world[engine.addresses.feet] = True
+        self.delay = int(episode.params.delay)
+        self.push = push_at(episode.params, np.arange(steps)[:, None])
+        self.state = self.program.init(self.inputs.at(0), requests(episode))
+        self.done, self.fell = 0, False
+
+    def plan(self, tick: int) -> bool:
+        """Plan at the beginning of a control tick; whether the robot stands."""
+        values = self.inputs.at_tick(tick, tick * self.per_tick)
+        clock = time.perf_counter()
+        self.state, log = self.program.plan(self.state, values)
+        self.logs.append(np.asarray(log))
+        self.plan_time[tick] = time.perf_counter() - clock
+        self.body_contact[tick] = not self.is_foot_or_world[self.data.contact.geom].all()
+        self.fell = not self.logs[-1][-1]  # alive, the last entry
+        return not self.fell
+
+    def act_and_step(self, tick: int) -> None:
+        """The physics steps of a control tick."""
+        model, data, torque = self.engine.model, self.data, self.torque
+        at = self.engine.addresses
+        for i in range(tick * self.per_tick, (tick + 1) * self.per_tick):
+            self.qpos[i], self.qvel[i] = data.qpos, data.qvel
+            self.foot_force[i] = data.sensordata[at.foot_force]
+            if i % self.per_act:
+                torque[i], self.act_time[i] = torque[i - 1], self.act_time[i - 1]
+            else:
+                values = self.inputs.at(i)
+                clock = time.perf_counter()
+                self.state, command = self.program.act(self.state, values)
+                torque[i] = command
+                self.act_time[i] = time.perf_counter() - clock
+            data.ctrl[:] = torque[i - self.delay] if i >= self.delay else 0.0
+            data.xfrc_applied[at.trunk, :3] = self.push[i]
+            mujoco.mj_step(model, data)
+            self.done = i + 1
+
+    def recording(self, wall: float, *, interrupted: bool) -> Recording:
+        """What was walked."""
+        engine, done, began = self.engine, self.done, len(self.logs)
+        at = engine.addresses
+        qpos, qvel = self.qpos[:done], self.qvel[:done]
+        origin = self.episode.params.origin
+        x, feet = sagittal(engine.robot.params, engine.observe, qpos, qvel, origin)
+        legs = at.sign.reshape(-1) * self.torque[:done, at.actuator.reshape(-1)]
+
+        def one(series: np.ndarray) -> np.ndarray:
+            return np.asarray(series)[:, None]
+
+        return Recording(
+            episodes=[self.episode],
+            dt=engine.spec.scene.sim_dt,
+            per_tick=self.per_tick,
+            samples=np.array([done]),
+            ticks=np.array([began]),
+            fell=np.array([self.fell]),
+            qpos=one(qpos),
+            qvel=one(qvel),
+            torque=one(legs),
+            x=one(x),
+            feet=one(feet),
+            foot_force=one(self.foot_force[:done]),
+            log=TickLog(*map(one, self.program.unpack_log(np.stack(self.logs)))),
+            body_contact=one(self.body_contact[:began]),
+            plan_time=one(self.plan_time[:began]),
+            act_time=one(self.act_time[:done]),
+            wall_time=wall,
+            interrupted=interrupted,
+        )
+
+
 def simulate(
-    engine: MujocoEngine,
-    config: RunConfig | None = None,
-    *,
-    seed: int | None = None,
-    terrain_seed: int | None = None,
-    on_tick: OnTick | None = None,
+    engine: MujocoEngine, episode: Episode, *, on_tick: OnTick | None = None
 ) -> Trajectory:
-    """One episode. It ends at the config's duration, at a fall, or at Ctrl-C (and then returns).
+    """One episode. It ends at its duration, at a fall, or at Ctrl-C (and then returns).
 
     Args:
-      engine: with the config's ``batch_spec``.
-      config: of the episode, in place of the one that the engine was built from.
-      seed: of noise and initial state, in place of the config's.
-      terrain_seed: of the obstacles, in place of the config's; moves those of the model.
+      engine: with the episode's spec.
+      episode: from ``sim.resolve.resolve_episode``.
       on_tick: called once per control tick.
 
     Raises:
-      ValueError: for a config that needs another engine.
+      ValueError: for an episode that needs another engine.
     """
-    config = engine.config if config is None else config
-    if seed is not None:
-        config = dataclasses.replace(config, seed=seed)
-    if terrain_seed is not None:
-        terrain = dataclasses.replace(config.terrain, seed=terrain_seed)
-        config = dataclasses.replace(config, terrain=terrain)
-    require_one_spec(engine.spec, [config])
-    return engine._episode(config, on_tick).trajectory(0)
+    require_one_spec(engine.spec, [episode])
+    return engine._walk(episode, on_tick).trajectory(0)
 
 
 def _until_ctrl_c(ticks: Iterable[int]) -> Iterator[int]:

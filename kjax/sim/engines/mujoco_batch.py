@@ -10,7 +10,7 @@ that of a single run to the last bit.
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from copy import copy
 from threading import Event
@@ -22,22 +22,28 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from kjax.config import RunConfig
 from kjax.controllers.params import Tables
-from kjax.robots import get_robot
+from kjax.robots import Robot, get_robot
+from kjax.sim.batching import rows_of, stack_tables
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop
-from kjax.sim.engines.contract import OnProgress, Torques, check_delay, require_one_batch, ticks_of
-from kjax.sim.episode import initial_state
+from kjax.sim.engines.contract import (
+    OnProgress,
+    Torques,
+    check_delay,
+    require_one_batch,
+    require_torques,
+)
+from kjax.sim.episode import (
+    BatchSpec,
+    Episode,
+    EpisodeParams,
+    initial_state,
+    push_at,
+    stack_params,
+)
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, empty_log, recording_of_ticks
-from kjax.sim.resolve import (
-    EpisodeParams,
-    batch_spec,
-    push_at,
-    stack_episodes,
-    stack_tables,
-)
-from kjax.sim.scene import apply_scene, build_model
+from kjax.sim.scene import apply_world, build_model
 
 _WAIT = 0.1  # s between two looks at the threads
 
@@ -46,8 +52,8 @@ class Calls(NamedTuple):
     """Jitted functions of a group, batched over its robots.
 
     Attributes:
-      init: (tables, episode, sensed) -> state.
-      first: (tables, episode, state, step, sensed) -> (state, torque, log); plan and act.
+      init: (tables, params, sensed) -> state.
+      first: (tables, params, state, step, sensed) -> (state, torque, log); plan and act.
       then: the same without plan -> (state, torque).
     """
 
@@ -57,12 +63,12 @@ class Calls(NamedTuple):
 
 
 class BatchEngine:
-    """C MuJoCo for batches of configs with one ``sim.resolve.batch_spec``.
+    """C MuJoCo for batches of episodes with one spec.
 
     Compiles once per number of robots and kind of difference between them.
 
     Attributes:
-      spec: what all configs have in common.
+      spec: what all episodes have in common.
       model: MuJoCo model of the scene.
       torques: ``"every_step"``: at every physics step, as on the robot; ``"held"``: at the control
         rate, held in between, several times cheaper.
@@ -71,7 +77,7 @@ class BatchEngine:
 
     def __init__(
         self,
-        config: RunConfig,
+        spec: BatchSpec,
         *,
         torques: Torques = "every_step",
         threads: int | None = None,
@@ -80,50 +86,47 @@ class BatchEngine:
         """Scene and controller functions; nothing is compiled yet.
 
         Args:
-          config: one of those to come.
+          spec: of the episodes to come.
           torques: see the class.
           threads: as many as this process may use cores if ``None``.
           dtype: floating type of the controller.
         """
-        if torques not in ("every_step", "held"):
-            raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
+        require_torques(torques)
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}")
-        self.spec, self.torques, self.dtype = batch_spec(config), torques, np.dtype(dtype)
+        self.spec, self.torques, self.dtype = spec, torques, np.dtype(dtype)
         self.threads = _cores() if threads is None else threads
-        robot = get_robot(config.robot)
-        self.model = build_model(robot, config.sim, config.terrain, visual=False)
-        self._loop = build_closed_loop(robot, self.spec, self.model, held=torques == "held")
+        robot = get_robot(spec.scene.robot)
+        self.model = build_model(robot, spec.scene, visual=False)
+        self._loop = build_closed_loop(robot, spec, self.model, held=torques == "held")
         self._calls: dict[Any, Calls] = {}
 
-    def run(self, configs: Sequence[RunConfig], on_progress: OnProgress | None = None) -> Recording:
-        """Closed loops of all configs, each until its end or its fall.
+    def run(self, episodes: Sequence[Episode], on_progress: OnProgress | None = None) -> Recording:
+        """Closed loops of all episodes, each until its end or its fall.
 
         On Ctrl-C what was walked is returned, marked as interrupted.
 
         Raises:
-          ValueError: for a config with another ``batch_spec``, or other durations.
+          ValueError: for an episode with another spec, or other durations.
         """
-        require_one_batch(self.spec, configs, self.torques)
-        threads = min(self.threads, len(configs))
-        size = -(-len(configs) // threads)
-        filled = [*configs, *[configs[-1]] * (threads * size - len(configs))]
+        require_one_batch(self.spec, episodes, self.torques)
+        threads = min(self.threads, len(episodes))
+        size = -(-len(episodes) // threads)
+        filled = [*episodes, *[episodes[-1]] * (threads * size - len(episodes))]
         tables, axes = stack_tables(filled, self.dtype)
-        episode = stack_episodes(filled)
+        params = stack_params(filled)
         calls = self._compiled(axes)
         stop, groups = Event(), []
         for first in range(0, len(filled), size):
             own = slice(first, first + size)
             groups.append(
                 _Group(
-                    self.model,
+                    self,
                     filled[own],
                     calls,
-                    self.torques,
-                    self.dtype,
                     stop,
-                    tables=_rows(tables, axes, own),
-                    episode=jax.tree.map(lambda a, s=own: a[s], episode),
+                    tables=rows_of(tables, axes, own),
+                    params=jax.tree.map(lambda a, s=own: a[s], params),
                 )
             )
         groups[0].warm_up()  # compile in one thread
@@ -135,14 +138,14 @@ class BatchEngine:
             np.concatenate(arrays, axis=-1) for arrays in zip(*(d[:2] for d in done), strict=True)
         ]
         series = [
-            np.concatenate(arrays, axis=1)[:, : len(configs)]
+            np.concatenate(arrays, axis=1)[:, : len(episodes)]
             for arrays in zip(*(d[2:] for d in done), strict=True)
         ]
         return recording_of_ticks(
-            configs,
+            episodes,
             self.spec.controller.control_dt,
-            ticks=parts[0][: len(configs)],
-            fell=parts[1][: len(configs)],
+            ticks=parts[0][: len(episodes)],
+            fell=parts[1][: len(episodes)],
             qpos=series[0],
             qvel=series[1],
             torque=series[2],
@@ -152,9 +155,9 @@ class BatchEngine:
         )
 
     @staticmethod
-    def check(config: RunConfig, torques: Torques) -> None:
-        """Raise a ValueError that says why this engine cannot walk a config, if it cannot."""
-        check_delay(config, torques)
+    def check(spec: BatchSpec, params: EpisodeParams, torques: Torques) -> None:
+        """Raise a ValueError that says why this engine cannot walk an episode, if it cannot."""
+        check_delay(spec, params, torques)
 
     def _compiled(self, axes: Any) -> Calls:
         """Batched and jitted functions for parameters with these axes."""
@@ -163,17 +166,17 @@ class BatchEngine:
         if key not in self._calls:
             loop = self._loop
 
-            def init(tables: Any, episode: Any, sensed: Any) -> Any:
-                return loop.init(tables, loop.noise(episode, jnp.zeros((), jnp.int32)), sensed)
+            def init(tables: Any, params: Any, sensed: Any) -> Any:
+                return loop.init(tables, loop.noise(params, jnp.zeros((), jnp.int32)), sensed)
 
-            def first(tables: Any, episode: Any, state: Any, step: Any, sensed: Any) -> Any:
-                noise = loop.noise(episode, step)
-                state, log = loop.plan(tables, episode.origin, state, noise, sensed)
+            def first(tables: Any, params: Any, state: Any, step: Any, sensed: Any) -> Any:
+                noise = loop.noise(params, step)
+                state, log = loop.plan(tables, params.origin, state, noise, sensed)
                 state, torque = loop.act(tables, state, noise, sensed)
                 return state, torque, log
 
-            def then(tables: Any, episode: Any, state: Any, step: Any, sensed: Any) -> Any:
-                return loop.act(tables, state, loop.noise(episode, step), sensed)
+            def then(tables: Any, params: Any, state: Any, step: Any, sensed: Any) -> Any:
+                return loop.act(tables, state, loop.noise(params, step), sensed)
 
             self._calls[key] = Calls(
                 init=jax.jit(jax.vmap(init, (axes, 0, 0))),
@@ -192,26 +195,24 @@ class _Group:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
-        configs: Sequence[RunConfig],
+        engine: BatchEngine,
+        episodes: Sequence[Episode],
         calls: Calls,
-        torques: Torques,
-        dtype: np.dtype,
         stop: Event,
         *,
         tables: Tables,
-        episode: EpisodeParams,
+        params: EpisodeParams,
     ):
-        config, count = configs[0], len(configs)
-        self._calls, self._stop, self._dtype = calls, stop, dtype
-        self._tables, self._episode = tables, episode
-        self._per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-        per_act = round(config.leg.act_dt / config.sim.sim_dt)
+        model, spec, count = engine.model, engine.spec, len(episodes)
+        self._calls, self._stop, self._dtype = calls, stop, engine.dtype
+        self._tables, self._params = tables, params
+        self._per_tick = spec.per_tick
         # Physics steps that share a torque.
-        self._unit = self._per_tick if torques == "held" else per_act
-        self.ticks = ticks_of(config)
+        self._unit = spec.per_tick if engine.torques == "held" else spec.per_act
+        self.ticks = episodes[0].ticks
         self.done = 0
-        models, at = scene_models(model, configs), find_addresses(get_robot(config.robot), model)
+        robot = get_robot(spec.scene.robot)
+        models, at = scene_models(robot, model, episodes), find_addresses(robot, model)
         self._batch = mujoco.batch.Batch(models[0], nsim=count, nthread=1)
         if any(one is not models[0] for one in models):
             self._batch.set_models(models)
@@ -219,14 +220,14 @@ class _Group:
         self._qpos, self._qvel = bind("qpos"), bind("qvel")
         self._sensordata, self._ctrl = bind("sensordata"), bind("ctrl")
         self._pushes = bind("xfrc_applied")[:, at.trunk, :3]
-        for i, one in enumerate(configs):
-            self._qpos[i], self._qvel[i] = initial_state(one, model)
+        for i, one in enumerate(episodes):
+            self._qpos[i], self._qvel[i] = initial_state(one.start, model, at)
         self._batch.forward()
         self._legs, self._sign = at.actuator.reshape(-1), at.sign.reshape(-1)
-        self._pushed = bool((episode.push_steps > 0).any())
+        self._pushed = bool((params.push_steps > 0).any())
         # Torques on their way to the joints, a ring of as many as the longest delay.
-        self._ring = np.zeros((1 + int(episode.delay.max()) // self._unit, count, model.nu))
-        self._delay = episode.delay // self._unit
+        self._ring = np.zeros((1 + int(params.delay.max()) // self._unit, count, model.nu))
+        self._delay = params.delay // self._unit
         self.fell_at = np.full(count, self.ticks)
         self.fell = np.zeros(count, bool)
         self._state: Any = None
@@ -244,16 +245,16 @@ class _Group:
     def warm_up(self) -> None:
         """Compile by calling, results dropped."""
         sensed, step = self.sensed(), np.int32(0)
-        state = self._calls.init(self._tables, self._episode, sensed)
-        state, *rest = self._calls.first(self._tables, self._episode, state, step, sensed)
+        state = self._calls.init(self._tables, self._params, sensed)
+        state, *rest = self._calls.first(self._tables, self._params, state, step, sensed)
         if self._unit < self._per_tick:
-            state, *rest = self._calls.then(self._tables, self._episode, state, step, sensed)
+            state, *rest = self._calls.then(self._tables, self._params, state, step, sensed)
         jax.block_until_ready((state, rest))
 
     def walk(self) -> None:
         """All ticks, until told to stop."""
-        tables, episode = self._tables, self._episode
-        state = self._calls.init(tables, episode, self.sensed())
+        tables, params = self._tables, self._params
+        state = self._calls.init(tables, params, self.sensed())
         alive = np.ones(len(self.fell), bool)
         ids: np.ndarray | None = None  # all
         series: tuple[np.ndarray, ...] = ()
@@ -261,7 +262,7 @@ class _Group:
             if self._stop.is_set() or not alive.any():
                 break
             step, sensed = tick * self._per_tick, self.sensed()
-            state, torque, log = self._calls.first(tables, episode, state, np.int32(step), sensed)
+            state, torque, log = self._calls.first(tables, params, state, np.int32(step), sensed)
             host = TickLog(*map(np.asarray, log))
             torque = np.asarray(torque)
             if not series:
@@ -283,7 +284,7 @@ class _Group:
             for i in range(0, self._per_tick, self._unit):
                 if i > 0:
                     state, torque = self._calls.then(
-                        tables, episode, state, np.int32(step + i), self.sensed()
+                        tables, params, state, np.int32(step + i), self.sensed()
                     )
                     torque = np.asarray(torque)
                 self._apply(torque, step + i)
@@ -300,7 +301,7 @@ class _Group:
             torque = self._ring[when, np.arange(len(torque))]
         self._ctrl[:] = torque
         if self._pushed:
-            self._pushes[:] = push_at(self._episode, step, self._unit)
+            self._pushes[:] = push_at(self._params, step, self._unit)
 
     def _advance(self, ids: np.ndarray | None, alive: np.ndarray) -> None:
         """Physics of the robots that are alive."""
@@ -345,29 +346,19 @@ def _run_threads(groups: list[_Group], stop: Event, on_progress: OnProgress | No
     return interrupted
 
 
-def scene_models(model: mujoco.MjModel, configs: Sequence[RunConfig]) -> list[mujoco.MjModel]:
-    """A copy of the scene for each config's terrain, floor, friction, payload; equal ones once."""
-    robot = get_robot(configs[0].robot)
-    made: dict[Any, mujoco.MjModel] = {}
+def scene_models(
+    robot: Robot, model: mujoco.MjModel, episodes: Sequence[Episode]
+) -> list[mujoco.MjModel]:
+    """A copy of the scene for each episode's world; equal ones once."""
+    made: dict[Hashable, mujoco.MjModel] = {}
     out = []
-    for config in configs:
-        sim = config.sim
-        key = (config.terrain, sim.friction, sim.payload, sim.start, sim.heading, sim.floor)
+    for episode in episodes:
+        key = episode.world.key()
         if key not in made:
             made[key] = copy(model)
-            apply_scene(robot, made[key], config.sim, config.terrain)
+            apply_world(robot, made[key], episode.world)
         out.append(made[key])
     return out
-
-
-def _rows(tables: Tables, axes: Any, rows: slice) -> Tables:
-    """Parameters of some robots of a batch."""
-    return jax.tree.map(
-        lambda axis, leaf: leaf if axis is None else jnp.asarray(leaf[rows]),
-        axes,
-        tables,
-        is_leaf=lambda a: a is None,
-    )
 
 
 def _cores() -> int:

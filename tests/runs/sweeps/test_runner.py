@@ -49,18 +49,19 @@ def calls(monkeypatch):
     log = SimpleNamespace(chunks=[], stop_at=None)
 
     class Engine:
-        def run(self, configs, on_progress):
+        def run(self, episodes, on_progress):
             if log.stop_at == len(log.chunks):
                 raise KeyboardInterrupt
-            log.chunks.append([config.seed for config in configs])
+            seeds = [int(one.params.seed) for one in episodes]
+            log.chunks.append(seeds)
             rows = [
-                {"fell": config.seed == 3, "velocity_rmse_mps": config.command.v_x[0]}
-                | ({} if config.seed == 3 else {"pitch_max_deg": float(config.seed)})
-                for config in configs
+                {"fell": seed == 3, "velocity_rmse_mps": float(one.goal.command.values[0, 0])}
+                | ({} if seed == 3 else {"pitch_max_deg": float(seed)})
+                for seed, one in zip(seeds, episodes, strict=True)
             ]
             return SimpleNamespace(interrupted=False, metrics=lambda: iter(rows))
 
-    monkeypatch.setattr(runner, "build_engine", lambda sweep, config, threads: Engine())
+    monkeypatch.setattr(runner, "build_engine", lambda sweep, spec, threads: Engine())
     return log
 
 

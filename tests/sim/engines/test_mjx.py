@@ -12,6 +12,7 @@ from kjax import RunConfig, load_config
 from kjax.robots import go1
 from kjax.sim.engines import mjx as mjx_engine
 from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.resolve import batch_spec, resolve_episodes, resolve_scene
 
 COMMON = {
     "sim.base": "planar",
@@ -47,15 +48,15 @@ def engine(configs):
     stop at different points: robot 1 meets its block in a contact that is 3e-8 apart then.
     """
 
-    def converging(config):
-        spec = mjx_engine.build_spec(go1.ROBOT, config.sim, config.terrain, visual=False)
+    def converging(scene):
+        spec = mjx_engine.build_spec(go1.ROBOT, scene, visual=False)
         spec.option.iterations = spec.option.ls_iterations = 50
         spec.option.tolerance, spec.option.ls_tolerance = 1e-15, 1e-6
         return spec.compile()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mjx_engine, "build_model", converging)
-        return mjx_engine.MjxEngine(configs[0], dtype=np.float64)
+        return mjx_engine.MjxEngine(batch_spec(configs[0]), dtype=np.float64)
 
 
 def closest_segment_point(a, b, point):
@@ -66,15 +67,15 @@ def closest_segment_point(a, b, point):
 
 @pytest.fixture(scope="module")
 def both(engine, configs):
-    in_c = BatchEngine(configs[0], dtype=np.float64, threads=1)
+    in_c = BatchEngine(batch_spec(configs[0]), dtype=np.float64, threads=1)
     in_c.model = engine.model  # the same options of the solver
     with pytest.MonkeyPatch.context() as patch:
         # MJX adds 1e-6 m^2 to the edge's squared length where a sphere touches the edge of a box,
         # which moves the contact along the edge by micrometres; robot 1 strikes one at 0.145 s.
         # Without that the two engines are one algorithm, and that is what is tested here.
         patch.setattr(mjx_math, "closest_segment_point", closest_segment_point)
-        on_mjx = engine.run(configs)
-    return on_mjx, in_c.run(configs)
+        on_mjx = engine.run(resolve_episodes(configs))
+    return on_mjx, in_c.run(resolve_episodes(configs))
 
 
 @pytest.mark.slow
@@ -125,11 +126,11 @@ def test_a_fallen_robot_is_flagged_and_frozen(both):
 @pytest.mark.slow
 def test_other_seeds_and_worlds_do_not_compile_again(engine, both, configs):
     other = [dataclasses.replace(config, seed=config.seed + 10) for config in configs]
-    again = engine.run(other)
+    again = engine.run(resolve_episodes(other))
     assert engine.traces == 1
     assert not np.array_equal(again.qpos[-1, 0], both[0].qpos[-1, 0])
 
 
 def test_mjx_refuses_what_it_cannot_simulate():
     with pytest.raises(ValueError, match=r"sim\.contacts"):
-        mjx_engine.build_model(RunConfig())
+        mjx_engine.build_model(resolve_scene(RunConfig())[0])

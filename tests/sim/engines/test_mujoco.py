@@ -13,8 +13,17 @@ from kjax.sim.closed_loop import standing
 from kjax.sim.engines.contract import get_engine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine
-from kjax.sim.episode import Trajectory, foot_slip, initial_state, metrics
+from kjax.sim.metrics import foot_slip, metrics
 from kjax.sim.noise import sensor_noise
+from kjax.sim.resolve import (
+    batch_spec,
+    resolve_episode,
+    resolve_episodes,
+    resolve_goal,
+    resolve_scene,
+    start_state,
+)
+from kjax.sim.trajectory import Trajectory
 from kjax.types import Observation
 
 SHORT = {
@@ -27,17 +36,22 @@ SHORT = {
 
 
 @pytest.fixture(scope="module")
-def simulation():
-    return MujocoEngine(load_config(RunConfig, None, SHORT))
+def episode():
+    return resolve_episode(load_config(RunConfig, None, SHORT))
 
 
 @pytest.fixture(scope="module")
-def run(simulation):
-    return simulate(simulation, seed=0)
+def simulation(episode):
+    return MujocoEngine(episode.spec)
 
 
-def test_it_trots_at_the_commanded_speed_without_falling(run, simulation):
-    result = metrics(run, simulation.config)
+@pytest.fixture(scope="module")
+def run(simulation, episode):
+    return simulate(simulation, episode)
+
+
+def test_it_trots_at_the_commanded_speed_without_falling(run, episode):
+    result = metrics(run, episode.goal)
     assert not result["fell"]
     assert result["qp_unsolved"] == 0
     # The command steps by 0.2 m/s in this short run: 0.04 is about twice what it does.
@@ -49,11 +63,11 @@ def test_it_trots_at_the_commanded_speed_without_falling(run, simulation):
 @pytest.mark.parametrize("height", [-0.03, 0.02])
 def test_it_walks_as_high_above_its_gaits_height_as_it_is_asked_to(simulation, run, height):
     config = load_config(RunConfig, None, SHORT | {"command.height": [0.0, height]})
-    other = simulate(simulation, config, seed=0)
+    other = simulate(simulation, resolve_episode(config))
     np.testing.assert_array_equal(other.x[:500], run.x[:500])
     rise = np.mean(other.x[-500:, 1] - run.x[-500:, 1])
     assert rise == pytest.approx(height, abs=1e-3)
-    assert metrics(other, config)["pitch_max_deg"] < 3.0
+    assert metrics(other, resolve_goal(config))["pitch_max_deg"] < 3.0
 
 
 FEET_ONLY = {"ground", "FR_foot", "FL_foot", "RR_foot", "RL_foot"}
@@ -70,10 +84,10 @@ def touching(simulation, run):
     return names
 
 
-def test_knees_and_trunk_stay_off_the_ground_and_feet_plant(run, simulation):
+def test_knees_and_trunk_stay_off_the_ground_and_feet_plant(run, simulation, episode):
     assert touching(simulation, run) == FEET_ONLY
     # 4 mm per stance: contact points creep in a soft friction cone, they do not slide
-    assert metrics(run, simulation.config)["foot_slip_m"] < 0.004
+    assert metrics(run, episode.goal)["foot_slip_m"] < 0.004
 
 
 def test_contacts_follow_the_schedule(run):
@@ -83,31 +97,32 @@ def test_contacts_follow_the_schedule(run):
     assert agreement.mean() > 0.95
 
 
-def test_the_same_seed_gives_the_same_run_and_another_seed_another(simulation, run):
-    again = simulate(simulation, seed=0)
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(simulation, run, episode):
+    again = simulate(simulation, episode)
     np.testing.assert_array_equal(again.qpos, run.qpos)
-    other = simulate(simulation, seed=1)
+    config = load_config(RunConfig, None, SHORT)
+    other = simulate(simulation, resolve_episode(config, seed=1))
     assert np.abs(other.qpos - run.qpos).max() > 1e-3
 
 
-def test_ctrl_c_keeps_what_was_simulated(simulation):
+def test_ctrl_c_keeps_what_was_simulated(simulation, episode):
     def stop(done, total, data):
         if done >= 100:
             raise KeyboardInterrupt
 
-    run = simulate(simulation, on_tick=stop)
+    run = simulate(simulation, episode, on_tick=stop)
     assert run.interrupted
     assert len(run.time) == len(run.torque) == len(run.stance) == 100
-    assert metrics(run, simulation.config)["interrupted"]
+    assert metrics(run, episode.goal)["interrupted"]
 
 
-def test_a_fall_ends_the_run_and_is_reported(simulation):
+def test_a_fall_ends_the_run_and_is_reported(simulation, episode):
     def kick(done, total, data):
         if done == 200:
             data.qvel[2] += 25.0
 
-    run = simulate(simulation, on_tick=kick)
-    result = metrics(run, simulation.config)
+    run = simulate(simulation, episode, on_tick=kick)
+    result = metrics(run, episode.goal)
     assert result["fell"]
     assert 0.2 < result["fall_time_s"] < 1.5
 
@@ -145,20 +160,20 @@ def test_a_trajectory_survives_saving(run, tmp_path):
 
 
 def test_noise_of_a_step_does_not_depend_on_the_length_of_the_run():
-    config = RunConfig(seed=3, sim=SimConfig(base="planar"))
-    whole = sensor_noise(config, 50)
-    np.testing.assert_array_equal(whole[:20], sensor_noise(config, 20))
-    np.testing.assert_array_equal(whole[30:], sensor_noise(config, 20, start=30))
-    spread = sensor_noise(config, 4000).std(axis=0)
+    _, params = resolve_scene(RunConfig(seed=3, sim=SimConfig(base="planar")))
+    whole = sensor_noise(params, "planar", 50)
+    np.testing.assert_array_equal(whole[:20], sensor_noise(params, "planar", 20))
+    np.testing.assert_array_equal(whole[30:], sensor_noise(params, "planar", 20, start=30))
+    spread = sensor_noise(params, "planar", 4000).std(axis=0)
     # 5 %: the standard error of a standard deviation of 4000 samples is 1.1 %
     np.testing.assert_allclose(spread[:3], [0.001, 0.001, 0.003], rtol=0.05)
 
 
 def test_the_robot_starts_on_its_feet():
     config = load_config(RunConfig, None, {"sim.base": "planar", "noise.enabled": False})
-    simulation = MujocoEngine(config)
+    simulation = MujocoEngine(batch_spec(config))
     data = mujoco.MjData(simulation.model)
-    data.qpos[:], data.qvel[:] = initial_state(config, simulation.model)
+    data.qpos[:], data.qvel[:] = start_state(config, simulation.model)
     mujoco.mj_forward(simulation.model, data)
     feet = [data.geom(f"{leg}_foot").xpos[2] for leg in ("FR", "FL", "RR", "RL")]
     np.testing.assert_allclose(feet, go1.FOOT_RADIUS, atol=1e-9)
@@ -195,13 +210,14 @@ IN_PLACE = {"sim.base": "planar", "command.times": [0.0], "command.v_x": [0.0]}
 def bounding():
     """Two seconds of bounding in place, the flights growing all the while."""
     config = load_config(RunConfig, None, IN_PLACE | {"duration": 2.0, "gait.names": ["bound"]})
-    simulation = MujocoEngine(config)
-    return simulation, simulate(simulation, seed=0)
+    episode = resolve_episode(config)
+    engine = MujocoEngine(episode.spec)
+    return engine, episode, simulate(engine, episode)
 
 
 def test_it_bounds_in_place_without_falling(bounding):
-    simulation, run = bounding
-    result = metrics(run, simulation.config)
+    _, episode, run = bounding
+    result = metrics(run, episode.goal)
     assert not result["fell"]
     assert result["qp_unsolved"] == 0
     # It drifts by 0.12 m before it settles; the reference itself pitches by 11 degrees.
@@ -211,11 +227,12 @@ def test_it_bounds_in_place_without_falling(bounding):
 
 
 def test_knees_and_trunk_stay_off_the_ground_in_a_bound(bounding):
-    assert touching(*bounding) == FEET_ONLY
+    engine, _, run = bounding
+    assert touching(engine, run) == FEET_ONLY
 
 
 def test_all_feet_of_a_bound_leave_the_ground(bounding):
-    _, run = bounding
+    _, _, run = bounding
     late = run.time > 1.0
     gap = run.feet[late, :, 1].min(axis=1) - go1.FOOT_RADIUS
     flying = (run.foot_force[late] == 0.0).all(axis=1) & (gap > 0.0)
@@ -231,7 +248,7 @@ def touchdowns(force):
 
 
 def test_front_feet_of_a_bound_touch_down_together_and_apart_from_the_rear_ones(bounding):
-    _, run = bounding
+    _, _, run = bounding
     right, left = (touchdowns(run.foot_force[:, i]) for i in (0, 1))
     assert len(right) == len(left) >= 5
     # The robot is symmetric; a few steps by the noise of each leg's own sensors.
@@ -251,9 +268,9 @@ def test_trot_to_bound_and_back_in_place(seed):
     chosen = IN_PLACE | {"duration": 6.0, "lmpc.model_dt": 0.02, "lmpc.horizon": 10}
     chosen |= {"lmpc.Q": [3.63, 18.15, 50.0, 25.07, 4.179, 3.454]}
     chosen |= {"gait.names": ["trot", "bound", "trot"], "gait.times": [0.0, 1.0, 2.0]}
-    simulation = MujocoEngine(load_config(RunConfig, None, chosen))
-    run = simulate(simulation, seed=seed)
-    result = metrics(run, simulation.config)
+    episode = resolve_episode(load_config(RunConfig, None, chosen), seed=seed)
+    run = simulate(MujocoEngine(episode.spec), episode)
+    result = metrics(run, episode.goal)
     assert not result["fell"]
     assert result["qp_unsolved"] == 0
 
@@ -280,7 +297,10 @@ def test_trot_to_bound_and_back_in_place(seed):
 def test_the_papers_velocity_profile_is_tracked(name, limit, repository):
     """Target of the project; the paper reports 0.029."""
     config = load_config(RunConfig, repository / "configs" / f"{name}.toml")
-    result = metrics(simulate(MujocoEngine(config), seed=3), config)
+    result = metrics(
+        simulate(MujocoEngine(batch_spec(config)), resolve_episode(config, seed=3)),
+        resolve_goal(config),
+    )
     assert not result["fell"]
     assert result["velocity_rmse_mps"] <= limit
     assert result["qp_unsolved"] == 0
@@ -297,26 +317,32 @@ def test_engines_are_found_by_name():
 
 
 def test_the_single_engine_walks_several_configs_and_records_every_step(simulation):
-    short = dataclasses.replace(simulation.config, duration=0.1)
+    short = load_config(RunConfig, None, SHORT | {"duration": 0.1})
     configs = [short, dataclasses.replace(short, seed=5, duration=0.05)]
     progress = []
-    recording = simulation.run(configs, lambda done, total: progress.append((done, total)))
+    recording = simulation.run(
+        resolve_episodes(configs), lambda done, total: progress.append((done, total))
+    )
     assert recording.qpos.shape[:2] == (100, 2)
     assert recording.samples.tolist() == [100, 50]
     assert recording.ticks.tolist() == [20, 10]
     assert progress[-1] == (150, 150)
     for robot, config in enumerate(configs):
-        alone, own = simulate(simulation, config), recording.trajectory(robot)
+        alone, own = simulate(simulation, resolve_episode(config)), recording.trajectory(robot)
         np.testing.assert_array_equal(own.qpos, alone.qpos)
         np.testing.assert_array_equal(own.stance, alone.stance)
         assert own.plan_time.shape == alone.plan_time.shape
     assert [row["simulated_s"] for row in recording.metrics()] == pytest.approx([0.1, 0.05])
 
 
-def test_torques_may_be_held_on_the_single_engine_too(simulation):
-    config = dataclasses.replace(simulation.config, duration=0.3)
-    single = simulate(MujocoEngine(config, torques="held", dtype=np.float64), config)
-    batch = BatchEngine(config, torques="held", dtype=np.float64, threads=1).run([config])
+def test_torques_may_be_held_on_the_single_engine_too():
+    config = load_config(RunConfig, None, SHORT | {"duration": 0.3})
+    single = simulate(
+        MujocoEngine(batch_spec(config), torques="held", dtype=np.float64), resolve_episode(config)
+    )
+    batch = BatchEngine(batch_spec(config), torques="held", dtype=np.float64, threads=1).run(
+        resolve_episodes([config])
+    )
     # The same functions, in another order of sums.
     np.testing.assert_allclose(single.qpos[::5], batch.qpos[:, 0], atol=1e-7)
     np.testing.assert_array_equal(single.torque[5:10], np.tile(single.torque[5], (5, 1, 1)))

@@ -10,8 +10,15 @@ from kjax.config import RunConfig, load_config
 from kjax.robots import go1
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine, scene_models
-from kjax.sim.episode import initial_state, metrics
+from kjax.sim.metrics import metrics
 from kjax.sim.observe import find_addresses
+from kjax.sim.resolve import (
+    batch_spec,
+    resolve_episode,
+    resolve_episodes,
+    resolve_goal,
+    start_state,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -43,31 +50,31 @@ def configs():
 
 @pytest.fixture(scope="module")
 def engine(configs):
-    return BatchEngine(configs[0], dtype=np.float64, threads=2)
+    return BatchEngine(batch_spec(configs[0]), dtype=np.float64, threads=2)
 
 
 @pytest.fixture(scope="module")
 def held(configs):
-    return BatchEngine(configs[0], torques="held", threads=2)
+    return BatchEngine(batch_spec(configs[0]), torques="held", threads=2)
 
 
 @pytest.fixture(scope="module")
 def recording(engine, configs):
-    return engine.run(configs)
+    return engine.run(resolve_episodes(configs))
 
 
 @pytest.fixture(scope="module")
 def held_recording(held, configs):
-    return held.run(configs)
+    return held.run(resolve_episodes(configs))
 
 
 def test_physics_is_that_of_single_robots_to_the_last_bit(held, held_recording, configs):
     """Held torques are recorded whole, so a plain loop over ``mj_step`` can repeat them."""
     actuators = find_addresses(go1.ROBOT, held.model).actuator.reshape(-1)
     for i, config in enumerate(configs):
-        (model,) = scene_models(held.model, [config])
+        (model,) = scene_models(go1.ROBOT, held.model, [resolve_episode(config)])
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = initial_state(config, model)
+        data.qpos[:], data.qvel[:] = start_state(config, model)
         mujoco.mj_forward(model, data)
         trunk = model.body("trunk").id
         delay = round(config.sim.delay / 0.005)
@@ -82,9 +89,9 @@ def test_physics_is_that_of_single_robots_to_the_last_bit(held, held_recording, 
 
 
 def test_closed_loops_are_those_of_single_runs(recording, configs):
-    single = MujocoEngine(configs[0])
+    single = MujocoEngine(batch_spec(configs[0]))
     for i, config in enumerate(configs):
-        alone = simulate(single, config)
+        alone = simulate(single, resolve_episode(config))
         assert not alone.fell
         # 1e-6: equal algorithms; a batch sums in another order, and contacts amplify that.
         np.testing.assert_allclose(recording.qpos[:, i], alone.qpos[::5], atol=1e-6)
@@ -93,7 +100,7 @@ def test_closed_loops_are_those_of_single_runs(recording, configs):
         np.testing.assert_allclose(own.torque, alone.torque[::5], atol=1e-3)
         np.testing.assert_array_equal(own.stance, alone.stance[::5])
         np.testing.assert_allclose(own.velocity_reference, alone.velocity_reference[::5])
-        few, many = metrics(own, config), metrics(alone, config)
+        few, many = metrics(own, resolve_goal(config)), metrics(alone, resolve_goal(config))
         error = (alone.x[:, 3] - alone.velocity_command)[500::5]  # from 0.5 s on, at the ticks
         assert few["velocity_rmse_mps"] == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-6)
         assert few["distance_m"] == pytest.approx(many["distance_m"], abs=5e-3)
@@ -114,7 +121,7 @@ def test_a_robot_that_falls_leaves_its_neighbours_as_they_are(held, held_recordi
     thrown = dataclasses.replace(
         configs[2], push=dataclasses.replace(configs[2].push, forward=80.0)
     )
-    other = held.run([*configs[:2], thrown, *configs[3:]])
+    other = held.run(resolve_episodes([*configs[:2], thrown, *configs[3:]]))
     assert other.fell.tolist() == [False, False, True, False, False]
     assert 20 < other.ticks[2] < 120
     assert len(other.trajectory(2).time) == other.ticks[2]
@@ -122,30 +129,32 @@ def test_a_robot_that_falls_leaves_its_neighbours_as_they_are(held, held_recordi
         np.testing.assert_array_equal(other.qpos[:, i], held_recording.qpos[:, i])
 
 
-def test_numbers_that_are_none_end_one_robot_only(held, held_recording, configs, monkeypatch):
+def test_numbers_that_are_none_end_one_robot_only(held, held_recording, configs):
     """A state that is not a number, from the first tick on, is a fall."""
-    from kjax.sim.engines import mujoco_batch
-
-    def start(config, model):
-        qpos, qvel = initial_state(config, model)
-        return (qpos * np.nan if config.seed == 1 else qpos), qvel
-
-    monkeypatch.setattr(mujoco_batch, "initial_state", start)
-    other = held.run(configs)
+    episodes = resolve_episodes(configs)
+    nowhere = episodes[1].start._replace(pose=np.nan * episodes[1].start.pose)
+    episodes[1] = dataclasses.replace(episodes[1], start=nowhere)
+    other = held.run(episodes)
     assert other.fell.tolist() == [False, True, False, False, False]
     assert other.ticks[1] == 1
     np.testing.assert_array_equal(other.qpos[:, 4], held_recording.qpos[:, 4])
 
 
-def test_it_says_which_config_does_not_fit(engine, held, configs):
-    with pytest.raises(ValueError, match=r"configs\[1\] needs another engine"):
-        engine.run([configs[0], load_config(RunConfig, None, COMMON | {"lmpc.horizon": 7})])
-    with pytest.raises(ValueError, match=r"configs\[1\]\.duration is 1\.0 s"):
-        engine.run([configs[0], dataclasses.replace(configs[0], duration=1.0)])
+def test_it_says_which_episode_does_not_fit(engine, held, configs):
+    with pytest.raises(ValueError, match=r"episodes\[1\] needs another engine"):
+        engine.run(
+            resolve_episodes(
+                [configs[0], load_config(RunConfig, None, COMMON | {"lmpc.horizon": 7})]
+            )
+        )
+    with pytest.raises(ValueError, match=r"episodes\[1\] takes 1\.0 s"):
+        engine.run(resolve_episodes([configs[0], dataclasses.replace(configs[0], duration=1.0)]))
     late = dataclasses.replace(configs[0], sim=dataclasses.replace(configs[0].sim, delay=0.003))
     with pytest.raises(ValueError, match=r"sim\.delay must be a multiple of lmpc\.control_dt"):
-        held.run([late])
-    with pytest.raises(ValueError, match="at least one config"):
+        held.run(resolve_episodes([late]))
+    with pytest.raises(ValueError, match="at least one episode"):
         engine.run([])
+    with pytest.raises(TypeError, match=r"episodes\[0\]: wanted an Episode .* got RunConfig"):
+        engine.run(configs)
     with pytest.raises(ValueError, match="torques must be"):
-        BatchEngine(configs[0], torques="often")
+        BatchEngine(batch_spec(configs[0]), torques="often")
