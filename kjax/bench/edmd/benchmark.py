@@ -1,0 +1,340 @@
+"""EDMD beside pykoopman, pykoop and NumPy: fits, their data, a stream; run by benchmark.py edmd.
+
+The peers need an interpreter of their own, which ``peers.py`` runs in: three rounds of it with
+rounds of ours in between. Everything runs on one core with one thread.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from tqdm import tqdm
+
+from kjax import cli
+from kjax.bench.edmd.data import (
+    PAPER,
+    Setting,
+    numpy_draw,
+    numpy_loop,
+    numpy_rollouts,
+    sampler,
+    setting,
+)
+from kjax.bench.edmd.stream import STREAM, stream
+from kjax.config import KoopmanConfig
+from kjax.koopman import edmd, models, observables, regression
+from kjax.koopman.dataset import Snapshots
+from kjax.types import STATE_NAMES
+
+PEERS = ("pykoopman", "pykoop")
+SCRIPT = Path(__file__).with_name("peers.py")
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+ROUNDS = 3  # of every timing, in turn with those beside it; medians over all calls are reported
+CALLS = 30  # timed fits in a round
+SEEDS = 10
+# (order, with the constant rotation): the paper's first, all of them cuts of the largest.
+DICTIONARIES = tuple((order, constant) for order in (4, 3, 2, 1, 0) for constant in (False, True))
+LARGEST = observables.paper(4, constant_rotation=True)
+
+KEYS = ("fit_ms", "regression_ms", "many_s", "many_lifted_s")
+
+TEST_ROLLOUTS, TEST_STEPS = 100, 50  # held out
+VELOCITIES = slice(3, 6)
+
+ROLLOUTS = 10_000  # whose generation is timed
+LOOP = 20  # of them in the loop over rollouts and steps; the rest by proportion
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument(
+        "--peers",
+        metavar="PYTHON",
+        help="interpreter of an environment with pykoopman and pykoop; without it, none of them",
+    )
+
+
+def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """All measurements; leaves figure.png and table.md in the folder."""
+    versions = peer_versions(args.peers) if args.peers else {}
+    _one_thread()
+    missing = [name for name in PEERS if name not in versions]
+    if missing:
+        print(f"left out: {', '.join(missing)} (--peers names the Python that has them)")
+    quick, here = args.quick, setting()
+    result: dict[str, Any] = {"peers": versions, "missing": missing}
+    # First, while the largest memory that this process ever had is still that of its imports.
+    print("stream of snapshots")
+    result["stream"] = stream(here, STREAM // 100 if quick else STREAM)
+    print("fits")
+    result["fits"] = fits(here, args.peers, versions, 5 if quick else CALLS)
+    print("rollouts")
+    result["rollouts"] = rollouts(here, ROLLOUTS // 10 if quick else ROLLOUTS, LOOP)
+    result |= summary(result)
+    (folder / "table.md").write_text(table(result), encoding="utf-8")
+    figure(result, folder / "figure.png")
+    return result
+
+
+def summary(result: dict[str, Any]) -> dict[str, Any]:
+    """The figures that matter; None where a peer is absent."""
+    found, data = result["fits"], result["rollouts"]
+
+    def ratio(peer: str) -> float | None:
+        return found["fit_ms"]["kjax"] / found["fit_ms"][peer] if peer in found["fit_ms"] else None
+
+    def speedup(key: str) -> float | None:
+        rivals = [seconds for name, seconds in found[key].items() if name != "kjax"]
+        return min(rivals) / found[key]["kjax"] if rivals else None
+
+    return {
+        "fit_over_pykoopman": ratio("pykoopman"),
+        "fit_over_pykoop": ratio("pykoop"),
+        "fits100_speedup": speedup("many_s"),
+        "fits100_speedup_lifted_once": speedup("many_lifted_s"),
+        "rollouts_speedup": data["kjax"] / data["numpy_loop"],
+        "rollouts_over_vectorised_numpy": data["kjax"] / data["numpy_vectorised"],
+        "streaming_snapshots_per_s": result["stream"]["snapshots_per_s"],
+    }
+
+
+def _one_thread() -> None:
+    """Start this program anew with one thread for linear algebra, unless it was started so.
+
+    OpenBLAS reads the number when it is loaded, which is before the first line of ours.
+    """
+    if any(os.environ.get(name) != "1" for name in THREADS):
+        sys.stdout.flush()
+        environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
+
+
+def _timed(call: Callable[[], Any]) -> float:
+    clock = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - clock
+
+
+# ---------------------------------------------------------------- fits
+
+
+def fits(here: Setting, python: str | None, versions: Any, calls: int) -> dict[str, Any]:
+    """One fit and a hundred of them, in time and error; one median per solver and quantity.
+
+    Returns:
+      ``fit_ms`` from states and ``regression_ms`` from lifted states; ``many_s`` for all data sets
+      with all dictionaries, ``many_lifted_s`` the same where each data set is lifted once, in the
+      largest dictionary; ``error`` with the largest and the root-mean-square error of each velocity
+      after the test rollouts [m/s, rad/s]; ``many_timed``, how many of a peer's fits were timed.
+    """
+    keys = jax.random.split(jax.random.key(KoopmanConfig().dataset.seed), SEEDS + 1)
+    data = jax.lax.map(sampler(here, here.rollouts, here.steps), keys[1:])
+    test = sampler(here, TEST_ROLLOUTS, TEST_STEPS)(keys[0])
+    first = jax.tree.map(lambda leaf: leaf[0], data)
+    fit, regress = jax.jit(partial(edmd.fit, PAPER)), jax.jit(_regress)
+    rows = jax.jit(partial(edmd.regressors, PAPER))(first)
+    ours: dict[str, tuple[Callable[[], Any], int, float]] = {
+        "fit_ms": (lambda: fit(first), calls, 1e3),
+        "regression_ms": (lambda: regress(*rows), calls, 1e3),
+        "many_s": (lambda: many(data), 3, 1.0),
+    }
+    for call, _, _ in ours.values():
+        jax.block_until_ready(call())
+    times: dict[str, dict[str, list[float]]] = {key: {"kjax": []} for key in KEYS}
+    ends = {"kjax": np.asarray(predict(fit(first)[0], test))}
+    done = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "data.npz"
+        np.savez(path, states=data.states, inputs=data.inputs, test_states=test.states,
+                 test_inputs=test.inputs, dictionaries=DICTIONARIES, calls=calls)  # fmt: skip
+        for _ in tqdm(range(ROUNDS), desc="rounds", leave=False, disable=None):
+            for key, (call, count, unit) in ours.items():
+                times[key]["kjax"] += [unit * _timed(call) for _ in range(count)]
+            times["many_lifted_s"]["kjax"] = times["many_s"]["kjax"]  # it lifts once as it is
+            for name, entry in (_peers(python, path) if versions else {}).items():
+                for key in KEYS:
+                    values = entry[key] if isinstance(entry[key], list) else [entry[key]]
+                    times[key].setdefault(name, []).extend(values)
+                ends[name] = np.asarray(entry["end"])
+                done[name] = min(entry["many_done"], done.get(name, len(DICTIONARIES) * SEEDS))
+    result: dict[str, Any] = {
+        key: {name: float(np.median(values)) for name, values in entry.items()}
+        for key, entry in times.items()
+    }
+    truth = np.asarray(test.states[:, -1])
+    result["error"] = {
+        name: {
+            "max": np.abs(end - truth).max(axis=0)[VELOCITIES],
+            "rms": np.sqrt(((end - truth) ** 2).mean(axis=0))[VELOCITIES],
+        }
+        for name, end in ends.items()
+    }
+    result["many_timed"] = done
+    return result
+
+
+def cuts() -> np.ndarray:
+    """Observables (dictionaries, N) of the largest dictionary that each of the others uses."""
+    smaller = (observables.paper(order, constant_rotation=c) for order, c in DICTIONARIES)
+    return np.array([[name in one.names for name in LARGEST.names] for one in smaller])
+
+
+@jax.jit
+def many(data: Snapshots) -> Any:
+    """Models and reports of all data sets (leading axis) in all dictionaries."""
+    use = jnp.asarray(cuts())
+
+    def one(data: Snapshots) -> Any:
+        return jax.vmap(lambda use: edmd.fit(LARGEST, data, use=use))(use)
+
+    return jax.lax.map(one, data)  # one after the other: ten data sets at once leave the cache
+
+
+def _regress(Z: jax.Array, Y: jax.Array) -> regression.Weights:
+    return regression.solve(regression.of_rows(Z, Y), Z.shape[1])
+
+
+@jax.jit
+def predict(model: models.LinearModel, test: Snapshots) -> jax.Array:
+    """States (rollouts, 6) at the end of the test rollouts, lifted once at their start."""
+
+    def one(states: jax.Array, inputs: jax.Array, feet: jax.Array) -> jax.Array:
+        return models.rollout(model, PAPER.lift(states[0]), inputs, feet)[-1]
+
+    return jax.vmap(one)(*test)
+
+
+def peer_versions(python: str) -> dict[str, str]:
+    """Versions of the peers that an interpreter has; ends the program where it has none."""
+    try:
+        done = subprocess.run([python, str(SCRIPT)], capture_output=True, text=True, check=False)
+        versions = json.loads(done.stdout)
+    except OSError as error:
+        cli.fail(f"--peers {python}: {error.strerror}")
+    except json.JSONDecodeError:
+        cli.fail(f"--peers {python}: this is no Python that can run {SCRIPT.name}")
+    if not versions:
+        cli.fail(f"--peers {python}: it has neither of {', '.join(PEERS)}")
+    return versions
+
+
+def _peers(python: str | None, data: Path) -> dict[str, Any]:
+    """One round of the peers, on the core that this process is bound to."""
+    out = data.with_name("out.json")
+    command = [str(python), str(SCRIPT), str(data), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        cli.fail(f"--peers {python}: {(done.stderr.strip() or 'it failed').splitlines()[-1]}")
+    return json.loads(out.read_text(encoding="utf-8"))
+
+
+# ---------------------------------------------------------------- rollouts
+
+
+def rollouts(here: Setting, count: int, looped: int) -> dict[str, float]:
+    """Rollouts per second, random numbers included: kjax, a NumPy loop, vectorised NumPy."""
+    draw, key, rng = sampler(here, count, here.steps), jax.random.key(0), np.random.default_rng(0)
+    body, alpha = jax.tree.map(np.asarray, here.body), np.asarray(here.alpha)
+    calls = {
+        "kjax": (lambda: draw(key), count),
+        "numpy_vectorised": (
+            lambda: numpy_rollouts(body, alpha, *numpy_draw(rng, here, count), here.dt),
+            count,
+        ),
+        "numpy_loop": (
+            lambda: numpy_loop(body, alpha, *numpy_draw(rng, here, looped), here.dt),
+            looped,
+        ),
+    }
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for round_ in range(2 * ROUNDS + 1):  # the first one warms up
+        for name, (call, number) in calls.items():
+            spent = _timed(call)
+            if round_:
+                times[name].append(spent / number)
+    return {name: 1.0 / float(np.median(values)) for name, values in times.items()}
+
+
+# ---------------------------------------------------------------- presentation
+
+
+def table(result: dict[str, Any]) -> str:
+    """All of it as Markdown."""
+    found, data, flow = result["fits"], result["rollouts"], result["stream"]
+    names = list(found["fit_ms"])
+    titles = [f"{name} {result['peers'].get(name, '')}".strip() for name in names]
+    lines = [f"| one fit, {PAPER.size} observables | {' | '.join(titles)} |",
+             "|---" * (len(names) + 1) + "|"]  # fmt: skip
+    for key, title, unit in (
+        ("fit_ms", "10,000 snapshots, from states", "ms"),
+        ("regression_ms", "the regression alone, from lifted states", "ms"),
+        ("many_s", "100 fits, from states", "s"),
+        ("many_lifted_s", "100 fits, each data set lifted once", "s"),
+    ):
+        values = " | ".join(f"{found[key][name]:.3g} {unit}" for name in names)
+        lines.append(f"| {title} | {values} |")
+    for i, velocity in enumerate(STATE_NAMES[VELOCITIES]):
+        values = " | ".join(f"{found['error'][name]['max'][i]:.2e}" for name in names)
+        unit = "rad/s" if velocity == "omega" else "m/s"
+        lines.append(f"| largest error of {velocity} after 50 ms [{unit}] | {values} |")
+    if result["missing"]:
+        lines.append(f"\nNot measured: {', '.join(result['missing'])}.")
+    part = {name: n for name, n in found["many_timed"].items() if n < len(DICTIONARIES) * SEEDS}
+    for name, number in part.items():
+        lines.append(f"\nOf the 100 fits of {name}, {number} were timed; the rest by proportion.")
+    lines += ["", "| rollouts of 100 steps | per second |", "|---|---|"]
+    for name, title in (
+        ("kjax", "kjax, one compiled call"),
+        ("numpy_vectorised", "NumPy, vectorised over rollouts"),
+        ("numpy_loop", f"NumPy, rollout by rollout and step by step ({LOOP} timed)"),
+    ):
+        lines.append(f"| {title} | {data[name]:,.0f} |")
+    lines += [
+        "",
+        f"| stream of {flow['snapshots']:,} snapshots | |",
+        "|---|---|",
+        f"| lifted and into the QR factor | {flow['snapshots_per_s']:,.0f} per second |",
+        f"| with their drawing | {flow['snapshots_per_s_with_drawing']:,.0f} per second |",
+        f"| peak memory, programs included | {flow['peak_MB']:.0f} MB |",
+        f"| of it after the first hundredth | {flow['growth_MB']:.0f} MB |",
+        f"| what all rows would take | {flow['all_rows_MB']:,.0f} MB |",
+        f"| coefficients, relative to one factorisation | {flow['coefficients_difference']:.1e} |",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Times of the fits and rates of the rollouts."""
+    fig, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
+    found, data = result["fits"], result["rollouts"]
+    panels = (
+        ("fit_ms", "regression_ms", "regression alone", "one fit, 10,000 snapshots", "ms"),
+        ("many_s", "many_lifted_s", "lifted once", "10 data sets x 10 dictionaries", "s"),
+    )
+    for ax, (*keys, label, title, unit) in zip(axes[:2], panels, strict=True):
+        labels = ("from states", label)
+        names = list(found[keys[0]])
+        place = np.arange(len(names))
+        for i, (key, label) in enumerate(zip(keys, labels, strict=True)):
+            ax.bar(place + 0.4 * i - 0.2, [found[key][n] for n in names], 0.4, label=label)
+        ax.set_xticks(place, names)
+        ax.set(title=title, ylabel=f"time [{unit}]")
+        ax.legend(fontsize=8)
+    labels = ("kjax", "NumPy,\nvectorised", "NumPy,\nloop")
+    axes[2].bar(labels, [data[n] for n in ("kjax", "numpy_vectorised", "numpy_loop")])
+    axes[2].set(title="data: rollouts of 100 steps", ylabel="rollouts per second", yscale="log")
+    fig.savefig(path, dpi=120)
+    plt.close(fig)

@@ -1,0 +1,102 @@
+"""The QPs of closed loops, recorded by standing in for the solver while the planner is traced."""
+
+from typing import Any
+from unittest import mock
+
+import jax
+import mujoco
+import numpy as np
+from tqdm import tqdm
+
+from kjax import qp
+from kjax.config import RunConfig, load_config
+from kjax.config.shipped import shipped_config
+from kjax.controllers import planning
+from kjax.controllers.controller import build_controller
+from kjax.controllers.resolve import controller_spec
+from kjax.mpc import lmpc, multiphase
+from kjax.sim.engines.mujoco import MujocoEngine
+from kjax.sim.episode import initial_state
+
+
+def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
+    """What ``planner`` returns as memory along a walk of the config's own controller."""
+    simulation = MujocoEngine(config)
+    controller, model = build_controller(controller_spec(config)), simulation.model
+    tables = simulation.program(config).tables
+    recorder = build_controller(controller_spec(config), planner)
+    plan, act = jax.jit(controller.plan), jax.jit(controller.act)
+    look = jax.jit(lambda state, seen: recorder.plan(tables, state, seen)[0].memory)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = initial_state(config, model)
+    mujoco.mj_forward(model, data)
+    state, kept = None, []
+    steps = round(seconds / config.sim.sim_dt)
+    per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
+    for i in tqdm(range(steps), desc="walking", leave=False, disable=None):
+        seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
+        if state is None:
+            state = controller.init(tables, seen)
+        if i % per_tick == 0:
+            kept.append(jax.tree.map(np.array, look(state, seen)))
+            state, _ = plan(tables, state, seen)
+        state, joints = act(tables, state, seen)
+        data.ctrl[simulation.addresses.actuator.reshape(-1)] = np.asarray(joints.torque).reshape(-1)
+        mujoco.mj_step(model, data)
+    return kept
+
+
+def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
+    config = load_config(RunConfig, shipped_config(f"{name}.toml"), changes or {})
+    own = planning.build_planner(controller_spec(config))
+
+    def planner(tables: Any, task: Any) -> Any:
+        seen: dict[str, Any] = {}
+
+        def solve(prepared: Any, q: Any, lower: Any, upper: Any, *args: Any, **options: Any) -> Any:
+            seen.update(q=q, lower=lower, upper=upper)
+            return real(prepared, q, lower, upper, *args, **options)
+
+        real = qp.solve
+        with mock.patch.object(lmpc.qp, "solve", solve):
+            plan = own(tables, task)
+        return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
+
+    mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
+    hessian = MujocoEngine(config).program(config).tables.lmpc.hessian
+    H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
+    used = (upper > lower).any(axis=1)  # nothing is planned in flight
+    return {
+        "prepared": jax.device_put(hessian),
+        "mode": mode[used],
+        "H": H,
+        "q": q[used],
+        "lower": lower[used],
+        "upper": upper[used],
+    }
+
+
+def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
+    """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
+    config = load_config(RunConfig, shipped_config("bound_multiphase.toml"), {})
+    own = planning.build_planner(controller_spec(config))
+
+    def planner(tables: Any, task: Any) -> Any:
+        seen: list[Any] = []
+
+        def solve(*args: Any, **options: Any) -> Any:
+            seen.append(args)
+            return real(*args, **options)
+
+        real = qp.solve_rows
+        # The planner holds both horizons behind a cond, whose tracers may not leave it.
+        with (
+            mock.patch.object(multiphase.qp, "solve_rows", solve),
+            mock.patch.object(planning.jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
+        ):
+            plan = own(tables, task)
+        return plan._replace(memory=seen[0])
+
+    kept = _drive(config, planner, seconds)
+    return [problem for problem in kept if (problem[6] > problem[5]).any()]
