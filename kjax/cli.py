@@ -46,10 +46,17 @@ class _Parser(argparse.ArgumentParser):
         fail(message)
 
 
-def run(main: Callable[[], None]) -> None:
-    """Call an experiment's ``main``; Ctrl-C, a full disk, a bad config end without a traceback."""
+def run(main: Callable[[Sequence[str] | None], int], argv: Sequence[str] | None = None) -> NoReturn:
+    """End the program with the exit code of a script's ``main``.
+
+    Ctrl-C, a full disk and a bad config end it without a traceback.
+
+    Args:
+      main: takes the words of the command line; returns the exit code.
+      argv: those words; of this process if ``None``.
+    """
     try:
-        main()
+        code = main(argv)
     except KeyboardInterrupt:
         print("interrupted before there was anything to keep", file=sys.stderr)
         raise SystemExit(130) from None
@@ -57,6 +64,7 @@ def run(main: Callable[[], None]) -> None:
         fail(f"{error.filename or 'output'}: {error.strerror or error}")
     except ConfigError as error:  # what only shows when a config is put to use
         fail(str(error))
+    raise SystemExit(code)
 
 
 def script_parser(description: str) -> argparse.ArgumentParser:
@@ -68,6 +76,7 @@ def script_parser(description: str) -> argparse.ArgumentParser:
 
 
 def parse_study(
+    argv: Sequence[str] | None,
     description: str,
     names: Sequence[str],
     *,
@@ -79,6 +88,7 @@ def parse_study(
     """Command line of a script that runs many episodes; a mistake ends the program.
 
     Args:
+      argv: words of the command line; of this process if ``None``.
       description: of the script.
       names: of its parts, for ``--only``.
       counts: options that are whole numbers from 1 on: default and help.
@@ -99,7 +109,7 @@ def parse_study(
     parser.add_argument("--base", choices=("planar", "free", "both"), default=base,
                         help=f"of the trunk (default: {base})")  # fmt: skip
     parser.add_argument("--quick", action="store_true", help=quick)
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     for name in args.only:
         if name not in names:
             fail(f"--only: got '{name}', wanted some of {', '.join(names)}")

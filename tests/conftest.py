@@ -253,6 +253,22 @@ def standing_run():
     return build
 
 
+@pytest.fixture
+def call(monkeypatch):
+    """Run the ``main`` of a script with some words, in this process: its exit code."""
+    from kjax import cli
+
+    monkeypatch.setattr(cli, "configure_jax", lambda **more: None)  # it binds to cores
+
+    def call(main, *words):
+        with pytest.raises(SystemExit) as end:
+            cli.run(main, [str(word) for word in words])
+        return end.value.code
+
+    yield call
+    jax.config.update("jax_enable_x64", True)  # sweeps and benchmarks choose their own
+
+
 @pytest.fixture(scope="session")
 def repository():
     """Root folder of the checkout."""

@@ -28,7 +28,7 @@ from kjax.config import to_dict
 from kjax.files import file_hashes
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-_NO_PHYSICS = ("viz", "runs", "cli.py")  # what cannot change an episode
+_NO_PHYSICS = ("viz", "runs", "bench", "studies", "cli.py")  # what cannot change an episode
 
 
 class CacheError(RuntimeError):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import runpy
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 from kjax.prediction import families, features, storage
+from kjax.studies.whole_body import recordings
 from kjax.sysid import open_loop, whole_body
 from kjax.sysid.transitions import Episode, split, transitions
 from kjax.types import MODE_ALPHA, Mode
@@ -325,9 +325,7 @@ def test_the_experiment_runs_and_records_once(repository, tmp_path, monkeypatch,
     assert (trot.spread[Mode.TROT, 3:5] > 1e-4).all()
     assert (trot.spread[Mode.TROT, 3:5] < 2e-2).all()
     # What lies there is taken, and only that.
-    monkeypatch.syspath_prepend(repository / "experiments")
-    script = runpy.run_path(str(repository / "experiments" / "whole_body.py"))
     options = SimpleNamespace(robots=10, duration=3.0, force=15.0)
-    episodes = script["record"]("trot", options, tmp_path)
+    episodes = recordings.record("trot", options, tmp_path)
     assert len(episodes) == 10
     assert capsys.readouterr().out == "trot: 10 episodes of 3 s are there\n"

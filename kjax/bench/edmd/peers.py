@@ -1,7 +1,7 @@
 """Other people's EDMD on given snapshots; ``benchmark.py edmd --peers PYTHON`` runs this.
 
-    PYTHON edmd_peers.py                      prints the versions of the peers that are there
-    PYTHON edmd_peers.py DATA.npz OUT.json    times them
+    PYTHON peers.py                      prints the versions of the peers that are there
+    PYTHON peers.py DATA.npz OUT.json    times them
 
 The peers (pykoopman, pykoop) want older versions of NumPy and scikit-learn than kjax does, so they
 live in an environment of their own and this file needs nothing of kjax. Each is used as its
@@ -14,7 +14,9 @@ import sys
 import time
 import types
 import warnings
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import numpy as np
 
@@ -29,13 +31,13 @@ class _Absent(types.ModuleType):
 
     __path__ = ()
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> type:
         if name.startswith("__"):
             raise AttributeError(name)
         return type(name, (), {})
 
 
-def import_peers():
+def import_peers() -> dict[str, Any]:
     """The peers that can be imported, by name.
 
     pykoopman imports torch and lightning for its neural networks, which nothing here uses: where
@@ -50,8 +52,10 @@ def import_peers():
             parent, _, child = name.rpartition(".")
             if parent:
                 setattr(sys.modules[parent], child, sys.modules[name])
-    found = {}
-    for name, build in (("pykoopman", Pykoopman), ("pykoop", Pykoop)):
+    found: dict[str, Any] = {}
+    builders: tuple[tuple[str, Callable[[], Any]], ...]
+    builders = (("pykoopman", Pykoopman), ("pykoop", Pykoop))
+    for name, build in builders:
         try:
             version(name)
             found[name] = build()
@@ -66,59 +70,60 @@ def import_peers():
 class Pykoopman:
     """EDMDc with one custom function per observable; all of them take all six states."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         import pykoopman
         from pykoopman.observables import CustomObservables
         from pykoopman.regression import EDMDc
 
         self.Koopman, self.Observables, self.EDMDc = pykoopman.Koopman, CustomObservables, EDMDc
 
-    def pack(self, states, inputs):
+    def pack(self, states: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, ...]:
         """Pairs of snapshots in the form that ``fit`` takes."""
         flat = (states[:, :-1], states[:, 1:], inputs)
         return tuple(np.ascontiguousarray(a.reshape(-1, a.shape[-1])) for a in flat)
 
-    def fit(self, data, order, constant):
+    def fit(self, data: Any, order: int, constant: bool) -> Any:
         """From states to a fitted model."""
         now, then, inputs = data
         observables = self.Observables(_functions(order, constant))
         model = self.Koopman(observables=observables, regressor=self.EDMDc())
         return model.fit(now, y=then, u=inputs, dt=DT)
 
-    def fit_lifted(self, now, then, inputs):
+    def fit_lifted(self, now: np.ndarray, then: np.ndarray, inputs: np.ndarray) -> Any:
         """The regression alone."""
         return self.EDMDc().fit(now, y=then, u=inputs)
 
-    def predict(self, model, starts, inputs):
+    def predict(self, model: Any, starts: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """States (rollouts, 6) at the end of the rollouts [m, rad, m/s, rad/s]."""
         rows = zip(starts, inputs, strict=True)
         return np.stack([model.simulate(x, u, n_steps=len(u))[-1] for x, u in rows])
 
 
-def _functions(order, constant):
+def _functions(order: int, constant: bool) -> list[Callable[..., np.ndarray]]:
     """One function per observable behind the six states, which pykoopman puts first itself."""
 
-    # How many arguments a function takes tells pykoopman what to call it with: no defaults here.
-    def cosine(power):
-        def function(p_x, p_z, theta, v_x, v_z, omega):
+    # How many arguments a function takes tells pykoopman what to call it with: no defaults here,
+    # and no annotations.
+    def cosine(power: int) -> Callable[..., np.ndarray]:
+        def function(p_x, p_z, theta, v_x, v_z, omega):  # type: ignore[no-untyped-def]
             return _times(np.cos(theta), omega, power)
 
         return function
 
-    def sine(power):
-        def function(p_x, p_z, theta, v_x, v_z, omega):
+    def sine(power: int) -> Callable[..., np.ndarray]:
+        def function(p_x, p_z, theta, v_x, v_z, omega):  # type: ignore[no-untyped-def]
             return _times(np.sin(theta), omega, power)
 
         return function
 
-    def one(p_x, p_z, theta, v_x, v_z, omega):
+    def one(p_x, p_z, theta, v_x, v_z, omega):  # type: ignore[no-untyped-def]
         return np.ones_like(theta)
 
     powers = range(0 if constant else 1, order + 1)
     return [one, *(kind(k) for k in powers for kind in (cosine, sine))]
 
 
-def _times(value, omega, power):
+def _times(value: np.ndarray, omega: np.ndarray, power: int) -> np.ndarray:
     for _ in range(power):
         value = value * omega
     return value
@@ -130,39 +135,39 @@ def _times(value, omega, power):
 class Pykoop:
     """Its pipeline with a lifting function of our own, which it asks for whole matrices."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         import pykoop
 
-        class Lift(pykoop.EpisodeIndependentLiftingFn):
-            def __init__(self, order=4, constant=False):
+        class Lift(pykoop.EpisodeIndependentLiftingFn):  # type: ignore[misc]
+            def __init__(self, order: int = 4, constant: bool = False) -> None:
                 self.order, self.constant = order, constant
 
-            def _fit_one_ep(self, X):
+            def _fit_one_ep(self, X: np.ndarray) -> tuple[int, int]:
                 return 7 + 2 * (self.order + self.constant), X.shape[1] - 6
 
-            def _transform_one_ep(self, X):
+            def _transform_one_ep(self, X: np.ndarray) -> np.ndarray:
                 return np.hstack([lift(X[:, :6], self.order, self.constant), X[:, 6:]])
 
-            def _inverse_transform_one_ep(self, X):
+            def _inverse_transform_one_ep(self, X: np.ndarray) -> np.ndarray:
                 return np.hstack([X[:, :6], X[:, self.n_states_out_ :]])
 
-            def _validate_parameters(self):
+            def _validate_parameters(self) -> None:
                 pass
 
-            def _transform_feature_names(self, feature_names, format=None):
+            def _transform_feature_names(self, feature_names: Any, format: Any = None) -> Any:
                 return feature_names
 
         self.pykoop, self.Lift = pykoop, Lift
         pykoop.set_config(skip_validation=True)
 
-    def pack(self, states, inputs):
+    def pack(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Episodes one below the other: number, state, input; the last input counts for nothing."""
         rollouts, rows = states.shape[:2]
         inputs = np.concatenate([inputs, inputs[:, -1:]], axis=1)
         number = np.broadcast_to(np.arange(float(rollouts))[:, None, None], (rollouts, rows, 1))
         return np.concatenate([number, states, inputs], axis=2).reshape(rollouts * rows, -1)
 
-    def fit(self, data, order, constant):
+    def fit(self, data: Any, order: int, constant: bool) -> Any:
         """From states to a fitted model."""
         model = self.pykoop.KoopmanPipeline(
             lifting_functions=[("paper", self.Lift(order, constant))],
@@ -171,19 +176,19 @@ class Pykoop:
         model.fit(data, n_inputs=4, episode_feature=True)
         return model
 
-    def fit_lifted(self, now, then, inputs):
+    def fit_lifted(self, now: np.ndarray, then: np.ndarray, inputs: np.ndarray) -> Any:
         """The regression alone."""
         Z = np.hstack([now, inputs])
         return self.pykoop.Edmd().fit(Z, then, n_inputs=inputs.shape[1], episode_feature=False)
 
-    def predict(self, model, starts, inputs):
+    def predict(self, model: Any, starts: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """States (rollouts, 6) at the end of the rollouts [m, rad, m/s, rad/s]."""
         still = np.repeat(starts[:, None], inputs.shape[1] + 1, axis=1)  # of them the first counts
         path = model.predict_trajectory(self.pack(still, inputs), relift_state=False)
         return path[:, 1:].reshape(len(starts), -1, 6)[:, -1]
 
 
-def lift(states, order, constant):
+def lift(states: np.ndarray, order: int, constant: bool) -> np.ndarray:
     """Observables (M, N) of states (M, 6): the states, 1, then cosine and sine by powers."""
     theta, omega = states[:, 2], states[:, 5]
     pair = np.stack([np.cos(theta), np.sin(theta)], axis=1)
@@ -196,7 +201,7 @@ def lift(states, order, constant):
     return np.hstack(blocks)
 
 
-def columns(order, constant):
+def columns(order: int, constant: bool) -> np.ndarray:
     """Columns of ``lift(states, order or more, True)`` that make up a smaller dictionary."""
     first = 7 if constant else 9
     return np.r_[:7, first : 9 + 2 * order]
@@ -205,7 +210,7 @@ def columns(order, constant):
 # ---------------------------------------------------------------- timing
 
 
-def main():
+def main() -> None:
     """Print versions, or time the peers on a file of data."""
     warnings.simplefilter("ignore")
     peers = import_peers()
@@ -218,7 +223,7 @@ def main():
         json.dump(measure(peers, data), file)
 
 
-def measure(peers, data):
+def measure(peers: Mapping[str, Any], data: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Per peer: times of single fits and of the regression alone, of all fits, predictions.
 
     Args:
@@ -234,13 +239,15 @@ def measure(peers, data):
     states, inputs = data["states"], data["inputs"]
     dictionaries = [(int(order), bool(constant)) for order, constant in data["dictionaries"]]
     single, calls = dictionaries[0], int(data["calls"])
-    now, then = (np.ascontiguousarray(s) for s in (states[:, :, :-1], states[:, :, 1:]))
-    now, then = (a.reshape(len(states), -1, 6) for a in (now, then))
+    now, then = (
+        np.ascontiguousarray(s).reshape(len(states), -1, 6)
+        for s in (states[:, :, :-1], states[:, :, 1:])
+    )
     forces = inputs.reshape(len(states), -1, 4)
     lifted = [lift(a[0], *single) for a in (now, then)]
     packed = {name: [p.pack(*d) for d in zip(states, inputs, strict=True)]
               for name, p in peers.items()}  # fmt: skip
-    result = {name: {"fit_ms": [], "regression_ms": []} for name in peers}
+    result: dict[str, Any] = {name: {"fit_ms": [], "regression_ms": []} for name in peers}
     for call in range(calls + 1):  # the first one warms up
         for name, peer in peers.items():
             clock = time.perf_counter()
@@ -258,7 +265,14 @@ def measure(peers, data):
     return result
 
 
-def many(peer, packed, now, then, forces, dictionaries):
+def many(
+    peer: Any,
+    packed: Sequence[Any],
+    now: np.ndarray,
+    then: np.ndarray,
+    forces: np.ndarray,
+    dictionaries: Sequence[tuple[int, bool]],
+) -> dict[str, Any]:
     """Time of fits of every data set in every dictionary, and of the same from lifted states [s].
 
     For the latter, a data set is lifted once, in the largest dictionary, and columns are cut out:
@@ -271,15 +285,15 @@ def many(peer, packed, now, then, forces, dictionaries):
     large = [[lift(a, order, True) for a in pair] for pair in zip(now, then, strict=True)]
     lifting = time.perf_counter() - clock
 
-    def from_lifted(seed, chosen):
+    def from_lifted(seed: int, chosen: tuple[int, bool]) -> None:
         use = columns(*chosen)
-        peer.fit_lifted(*(side[:, use] for side in large[seed]), forces[seed])
+        peer.fit_lifted(*(part[:, use] for part in large[seed]), forces[seed])
 
     cut, _ = _loop(from_lifted, places)
     return {"many_s": full, "many_lifted_s": lifting + cut, "many_done": done}
 
 
-def _loop(call, places):
+def _loop(call: Callable[..., Any], places: Sequence[tuple[int, Any]]) -> tuple[float, int]:
     """Time of a call at all places [s], if need be by proportion, and how many were timed."""
     clock, spent, done = time.perf_counter(), 0.0, 0
     while done < len(places) and spent < LIMIT:

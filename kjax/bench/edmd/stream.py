@@ -8,9 +8,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from edmd_data import PAPER, Setting, sampler
 from tqdm import tqdm
 
+from kjax.bench.edmd.data import PAPER, Setting, sampler
 from kjax.koopman import edmd, regression
 from kjax.koopman.dataset import Snapshots
 

@@ -10,13 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import qp_checks
-import qp_random_rows
-import qp_report
-from qp_peers import box_peers, daqp_cold
-from qp_problems import record_box, record_rows
 
 from kjax import cli, qp
+from kjax.bench.qp import checks, random_rows, report
+from kjax.bench.qp.peers import box_peers, daqp_cold
+from kjax.bench.qp.problems import record_box, record_rows
 
 BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
 HORIZONS = {40: 10, 80: 20, 200: 50, 400: 100}  # variables: steps of 20 ms of the long trot
@@ -52,7 +50,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     for name in GAITS:
         print(f"{name}: 24 variables")
         log = record_box(name, seconds)
-        result["gradient"][name] = qp_checks.gradients(log, 100 if quick else 1000)
+        result["gradient"][name] = checks.gradients(log, 100 if quick else 1000)
         result["box"][name] = box_single(log, peers)
         result["box"][name] |= box_in_scan(log)
         sizes = BATCHES[:4] if quick else BATCHES
@@ -65,7 +63,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         if variables >= 200:
             result["size"][variables] |= {
                 name: {"us_median": us}
-                for name, us in qp_checks.riccati_step(steps, states=13, inputs=4).items()
+                for name, us in checks.riccati_step(steps, states=13, inputs=4).items()
             }
         if quick:
             break
@@ -73,15 +71,15 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     print("bound_multiphase: rows")
     result["rows"] = rows_single(record_rows(seconds), peers)
     print("random problems")
-    result["random"] = qp_checks.random_solves(RANDOM // 100 if quick else RANDOM)
-    result["random_rows"] = qp_random_rows.count(RANDOM // 100 if quick else RANDOM)
-    result["random_rows_wrong"] = qp_random_rows.wrong(result["random_rows"])
+    result["random"] = checks.random_solves(RANDOM // 100 if quick else RANDOM)
+    result["random_rows"] = random_rows.count(RANDOM // 100 if quick else RANDOM)
+    result["random_rows_wrong"] = random_rows.wrong(result["random_rows"])
     if args.problems is not None:
         print(f"problems in {args.problems}")
-        result["public"] = qp_checks.public_problems(args.problems, peers)
+        result["public"] = checks.public_problems(args.problems, peers)
     result |= summary(result)
-    (folder / "table.md").write_text(qp_report.table(result), encoding="utf-8")
-    qp_report.figure(result, folder / "figure.png")
+    (folder / "table.md").write_text(report.table(result), encoding="utf-8")
+    report.figure(result, folder / "figure.png")
     return result
 
 

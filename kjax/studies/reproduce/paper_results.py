@@ -7,14 +7,12 @@ and one ``Row`` per number to show.
 import dataclasses
 import itertools
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from kjax.config import RunConfig, load_config
+from kjax.config.shipped import shipped_config
 from kjax.controllers.walkable import build_gaits
 from kjax.gait import Gait
-
-CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,7 +249,7 @@ def base_config(experiment: Experiment, base: str, *, quick: bool) -> RunConfig:
       ConfigError: where the config does not allow the overrides.
     """
     overrides = {"sim.base": base} | experiment.overrides
-    config = load_config(RunConfig, CONFIGS / experiment.config, overrides)
+    config = load_config(RunConfig, shipped_config(experiment.config), overrides)
     if not quick:
         return config
     last = len(config.gait.times) - 1

@@ -8,10 +8,10 @@ import numpy as np
 
 from kjax import cli
 from kjax.config import RunConfig, load_config
+from kjax.config.shipped import shipped_config
 from kjax.runs.cache import Cache, CacheError, open_cache
 from kjax.sysid.transitions import Episode
 
-CONFIGS = Path(__file__).parents[1] / "configs"
 DT = 0.005  # s, control tick of all these configs
 
 
@@ -56,7 +56,7 @@ def kind_configs(kind: str, robots: int, duration: float, force: float) -> list[
             at = np.round(early + rng.uniform(0.0, 1.0, len(early)), 3)
             keys["push.times"] = list(at)
             keys["push.forward"] = list(rng.uniform(-4.0, 4.0, len(at)))
-        configs.append(load_config(RunConfig, CONFIGS / chosen.config, keys))
+        configs.append(load_config(RunConfig, shipped_config(chosen.config), keys))
     return configs
 
 

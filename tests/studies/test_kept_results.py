@@ -1,8 +1,6 @@
 """What a study finds in its folder is shown again only where it would come out the same."""
 
-import importlib
 import json
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,43 +9,32 @@ import xarray as xr
 
 from kjax.config import SweepConfig, load_config, to_dict
 from kjax.prediction import storage
+from kjax.studies import model_walks, sweep
+from kjax.studies.whole_body import recordings
 from kjax.types import Mode
 
 MODELS = ("linear (the paper)", "SRB re-linearised")
 
 
-@pytest.fixture(scope="module")
-def scripts(repository):
-    sys.path.insert(0, str(repository / "experiments"))
-    names = ("model_walks", "whole_body_recordings", "reproduce", "sweep")
-    yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
-    sys.path.remove(str(repository / "experiments"))
-
-
 @pytest.fixture
-def walks(scripts, monkeypatch, tmp_path):
-    """Run model_walks.py --quick on trots with a stand-in for episodes; returns those it walked."""
-    module = scripts.model_walks
-    monkeypatch.setattr(module.cli, "configure_jax", lambda **more: None)
+def walks(call, monkeypatch, tmp_path):
+    """Run model_walks.py --quick on trots with a stand-in for episodes; returns those it ran."""
     walked = []
 
     def run(configs):
         walked.extend(configs)
         return [{"fell": False, "velocity_rmse_mps": 0.1, "pitch_p95_deg": 1.0} for _ in configs]
 
-    monkeypatch.setattr(module, "run", run)
-    monkeypatch.setattr(module, "figure", lambda walks, path: None)
+    monkeypatch.setattr(model_walks, "run", run)
+    monkeypatch.setattr(model_walks, "figure", lambda walks, path: None)
 
-    def call(*words):
+    def study(*words):
         walked.clear()
-        monkeypatch.setattr(
-            sys, "argv",
-            ["model_walks", "--quick", "--gaits", "trot", "--out", str(tmp_path), *map(str, words)],
-        )  # fmt: skip
-        module.main()
+        words = ("--quick", "--gaits", "trot", "--out", tmp_path, *words)
+        assert call(model_walks.main, *words) == 0
         return list(walked)
 
-    return call
+    return study
 
 
 def test_walks_are_found_again(walks, tmp_path):
@@ -58,27 +45,27 @@ def test_walks_are_found_again(walks, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["SPEEDS", "TUNE_SEEDS", "REPORT_SEEDS"])
-def test_edited_lists_are_walked(walks, scripts, monkeypatch, name):
+def test_edited_lists_are_walked(walks, monkeypatch, name):
     first = walks()
     other = {"SPEEDS": {"trot": (0.0, 0.4), "bound": (0.0, 0.5)}}.get(name, range(50, 60))
-    monkeypatch.setattr(scripts.model_walks, name, other)
+    monkeypatch.setattr(model_walks, name, other)
     assert len(walks()) == len(first)
     monkeypatch.undo()
 
 
-def test_a_model_with_other_keys_is_walked_and_the_others_are_not(walks, scripts, monkeypatch):
+def test_a_model_with_other_keys_is_walked_and_the_others_are_not(walks, monkeypatch):
     first = walks()
-    monkeypatch.setitem(scripts.model_walks.MODELS, MODELS[1], {"koopman.model": "planted"})
+    monkeypatch.setitem(model_walks.MODELS, MODELS[1], {"koopman.model": "planted"})
     again = walks()
     assert 0 < len(again) < len(first)
     assert {config.koopman.model for config in again} == {"planted"}
 
 
-def test_a_model_that_is_added_to_the_lists_walks_alone(walks, scripts, monkeypatch):
+def test_a_model_that_is_added_to_the_lists_walks_alone(walks, monkeypatch):
     first = walks()
-    real = scripts.model_walks.models_of
+    real = model_walks.models_of
     more = {"another": {"koopman.model": "planted"}}
-    monkeypatch.setattr(scripts.model_walks, "models_of", lambda *a: real(*a) | more)
+    monkeypatch.setattr(model_walks, "models_of", lambda *a: real(*a) | more)
     assert 0 < len(walks()) < len(first)
 
 
@@ -111,7 +98,7 @@ def test_with_other_code_everything_is_walked(walks, monkeypatch):
 
 
 @pytest.fixture
-def record(scripts, monkeypatch, tmp_path):
+def record(monkeypatch, tmp_path):
     """Record a kind of episodes with a stand-in for the engine; returns how many it recorded."""
     count = []
 
@@ -135,7 +122,7 @@ def record(scripts, monkeypatch, tmp_path):
     def call(*, robots=3, kind="trot"):
         count.clear()
         args = SimpleNamespace(robots=robots, duration=3.0, force=15.0)
-        assert len(scripts.whole_body_recordings.record(kind, args, tmp_path)) == robots
+        assert len(recordings.record(kind, args, tmp_path)) == robots
         return sum(count)
 
     return call
@@ -184,7 +171,7 @@ title = "one"
 
 
 @pytest.fixture
-def drawn(scripts, tmp_path):
+def drawn(tmp_path):
     """Draw a finished sweep with a file of this text."""
     (tmp_path / "walk.toml").write_text("")
     file = tmp_path / "sweep.toml"
@@ -199,7 +186,7 @@ def drawn(scripts, tmp_path):
         {"speed": [0.1, 0.3], "seed": [0, 1]},
         attrs={"sweep": json.dumps(to_dict(made)), "provenance": "{}"},
     ).to_netcdf(tmp_path / "sweep.nc", engine="h5netcdf")
-    return lambda text: scripts.sweep.draw(config(text), tmp_path, str(file))
+    return lambda text: sweep.draw(config(text), tmp_path, str(file))
 
 
 def test_a_sweep_may_be_drawn_with_another_figure(drawn, tmp_path):

@@ -1,6 +1,5 @@
 """The QPs of closed loops, recorded by standing in for the solver while the planner is traced."""
 
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -11,14 +10,13 @@ from tqdm import tqdm
 
 from kjax import qp
 from kjax.config import RunConfig, load_config
+from kjax.config.shipped import shipped_config
 from kjax.controllers import planning
 from kjax.controllers.controller import build_controller
 from kjax.controllers.resolve import controller_spec
 from kjax.mpc import lmpc, multiphase
 from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
-
-CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
@@ -50,7 +48,7 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
 
 def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
     """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
-    config = load_config(RunConfig, CONFIGS / f"{name}.toml", changes or {})
+    config = load_config(RunConfig, shipped_config(f"{name}.toml"), changes or {})
     own = planning.build_planner(controller_spec(config))
 
     def planner(tables: Any, task: Any) -> Any:
@@ -81,7 +79,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
 
 def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
     """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
-    config = load_config(RunConfig, CONFIGS / "bound_multiphase.toml", {})
+    config = load_config(RunConfig, shipped_config("bound_multiphase.toml"), {})
     own = planning.build_planner(controller_spec(config))
 
     def planner(tables: Any, task: Any) -> Any:

@@ -17,9 +17,10 @@ from typing import Any
 import jax
 import mujoco.batch
 import numpy as np
-import simulation_report
 
+from kjax.bench.simulation import report
 from kjax.config import RunConfig, load_config
+from kjax.config.shipped import shipped_config
 from kjax.robots import get_robot
 from kjax.sim.engines.mjx import MjxEngine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
@@ -28,7 +29,6 @@ from kjax.sim.episode import initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 BATCHES = (16, 128, 1024)
 MJX_BATCHES = (16, 128, 1024)
 ENGINE_CASES = 64  # walked by both engines
@@ -64,8 +64,8 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         result["machine_two_process_speedup"] = machine_speedup()
         result |= two_processes(folder)
     result |= headline(result)
-    (folder / "table.md").write_text(simulation_report.table(result), encoding="utf-8")
-    simulation_report.figure(result, folder / "figure.png")
+    (folder / "table.md").write_text(report.table(result), encoding="utf-8")
+    report.figure(result, folder / "figure.png")
     return result
 
 
@@ -96,7 +96,7 @@ def cases(gait: str, count: int, seconds: float) -> list[RunConfig]:
         "command.v_x": [speed],
         "lmpc.command_slew": 1.0,  # none shall fall: the fallen cost nothing
     }
-    config = load_config(RunConfig, CONFIGS / f"{name}.toml", overrides)
+    config = load_config(RunConfig, shipped_config(f"{name}.toml"), overrides)
     return [dataclasses.replace(config, seed=seed) for seed in range(count)]
 
 
@@ -220,14 +220,14 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
 def elsewhere(call: str) -> dict[str, Any]:
     """A function of this module in a process of its own, in which XLA uses all cores for MJX."""
     code = (
-        "import json, sys; sys.path.insert(0, sys.argv[1])\n"
+        "import json\n"
         "from kjax import cli; cli.configure_jax(parallel=True)\n"
         "import jax; jax.config.update('jax_enable_x64', False)\n"
-        "import simulation_benchmark as here\n"
+        "import kjax.bench.simulation.benchmark as here\n"
         f"print('RESULT' + json.dumps(here.{call}))\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(Path(__file__).parent)],
+        [sys.executable, "-c", code],
         stdout=subprocess.PIPE, text=True, check=True,
     )  # fmt: skip
     before, _, result = done.stdout.rpartition("RESULT")
@@ -246,7 +246,7 @@ def engines_agree() -> dict[str, Any]:
         "terrain.start": 0.5,
         "terrain.end": 1.4,
     }
-    config = load_config(RunConfig, CONFIGS / "trot_rough.toml", overrides)
+    config = load_config(RunConfig, shipped_config("trot_rough.toml"), overrides)
     configs = [
         dataclasses.replace(
             config, seed=seed, terrain=dataclasses.replace(config.terrain, seed=seed)
@@ -278,10 +278,10 @@ def engines_agree() -> dict[str, Any]:
 def mjx_compile_times() -> dict[str, float]:
     """First call of a closed loop of 16 robots with an empty compile cache, and with a full one."""
     code = (
-        "import sys, time; sys.path.insert(0, sys.argv[1])\n"
+        "import time\n"
         "from kjax import cli; cli.configure_jax(parallel=True)\n"
         "import jax; jax.config.update('jax_enable_x64', False)\n"
-        "import simulation_benchmark as b\n"
+        "import kjax.bench.simulation.benchmark as b\n"
         "from kjax.sim.engines.mjx import MjxEngine\n"
         "configs = b.cases('trot', 16, 0.05); engine = MjxEngine(configs[0])\n"
         "clock = time.perf_counter(); r = engine.run(configs)\n"
@@ -291,7 +291,7 @@ def mjx_compile_times() -> dict[str, float]:
     with tempfile.TemporaryDirectory() as cache:
         for _ in range(2):
             done = subprocess.run(
-                [sys.executable, "-c", code, str(Path(__file__).parent)],
+                [sys.executable, "-c", code],
                 env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache},
                 capture_output=True, text=True, check=True,
             )  # fmt: skip
@@ -320,12 +320,20 @@ def two_processes(folder: Path) -> dict[str, float]:
     process's first chunk, which loads the program. ``..._whole`` is that of the whole command, the
     start of which, some 15 s, does not get shorter.
     """
-    sweep = CONFIGS / "sweeps" / "benchmark.toml"
-    script = Path(__file__).with_name("sweep.py")
+    sweep = shipped_config("sweeps/benchmark.toml")
 
     def once(count: int, *options: str) -> tuple[float, float]:
         out = folder / f"processes_{count}"
-        common = [sys.executable, str(script), str(sweep), "--threads", "1", "--restart", *options]
+        common = [
+            sys.executable,
+            "-m",
+            "kjax.studies.sweep",
+            str(sweep),
+            "--threads",
+            "1",
+            "--restart",
+            *options,
+        ]
         clock = time.perf_counter()
         running = []
         for number in range(count):

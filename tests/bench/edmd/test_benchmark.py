@@ -1,6 +1,5 @@
 """What the EDMD benchmark compares is the same thing on both sides, and it counts it right."""
 
-import importlib
 import shutil
 import sys
 from argparse import Namespace
@@ -10,40 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from kjax.bench.edmd import benchmark, peers, stream
+from kjax.bench.edmd import data as drawing
 from kjax.dynamics import srb_planar
 from kjax.koopman import edmd, observables
 
 
 @pytest.fixture(scope="module")
-def benchmark(repository):
-    sys.path.insert(0, str(repository / "experiments"))
-    yield importlib.import_module("edmd_benchmark")
-    sys.path.remove(str(repository / "experiments"))
-
-
-@pytest.fixture(scope="module")
-def drawing(benchmark):
-    return importlib.import_module("edmd_data")
-
-
-@pytest.fixture(scope="module")
-def streaming(benchmark):
-    return importlib.import_module("edmd_stream")
-
-
-@pytest.fixture(scope="module")
-def peers(benchmark):
-    return importlib.import_module("edmd_peers")
-
-
-@pytest.fixture(scope="module")
-def small(drawing):
+def small():
     """The benchmark's setting with 14 rollouts of 50 steps: 700 snapshots, no multiple of 500."""
     return drawing.setting()._replace(rollouts=14, steps=50)
 
 
 @pytest.fixture(scope="module")
-def data(drawing, small):
+def data(small):
     """Three data sets of the small setting."""
     draw = drawing.sampler(small, small.rollouts, small.steps)
     return jax.lax.map(draw, jax.random.split(jax.random.key(0), 3))
@@ -75,7 +54,7 @@ class LeastSquares:
         return z[:, :6]
 
 
-def test_rollouts_in_numpy_are_those_of_kjax(drawing, small):
+def test_rollouts_in_numpy_are_those_of_kjax(small):
     rng = np.random.default_rng(0)
     x0, inputs = drawing.numpy_draw(rng, small, 5)
     alpha = np.array([2.0, 1.0])  # no symmetry that hides a swap of the ends
@@ -88,7 +67,7 @@ def test_rollouts_in_numpy_are_those_of_kjax(drawing, small):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
 
 
-def test_numpy_draws_from_the_ranges_of_kjax(drawing, small):
+def test_numpy_draws_from_the_ranges_of_kjax(small):
     x0, inputs = drawing.numpy_draw(np.random.default_rng(0), small, 200)
     ranges = small.ranges
     spread = (x0 - ranges.state_centre) / ranges.state_half
@@ -98,7 +77,7 @@ def test_numpy_draws_from_the_ranges_of_kjax(drawing, small):
     assert 0.0 <= part.min() < 0.01 < 0.99 < part.max() <= 1.0
 
 
-def test_a_hundred_fits_in_one_call_are_single_fits_in_their_dictionaries(benchmark, data):
+def test_a_hundred_fits_in_one_call_are_single_fits_in_their_dictionaries(data):
     models, reports = benchmark.many(data)
     use = benchmark.cuts()
     assert models.A.shape[:2] == (3, len(benchmark.DICTIONARIES)) == (3, 10)
@@ -115,19 +94,19 @@ def test_a_hundred_fits_in_one_call_are_single_fits_in_their_dictionaries(benchm
         np.testing.assert_allclose(models.B[i, j][use[j]], model.B, atol=1e-10)
 
 
-def test_a_stream_ends_in_the_coefficients_of_one_factorisation(streaming, data):
-    factor, sets = streaming.empty_factor(), []
+def test_a_stream_ends_in_the_coefficients_of_one_factorisation(data):
+    factor, sets = stream.empty_factor(), []
     for i in range(3):
         sets.append(jax.tree.map(lambda leaf: leaf[i], data))
-        factor = streaming.push(factor, sets[-1])
+        factor = stream.push(factor, sets[-1])
     assert factor.rows == 3 * 700  # the rest of 200 behind each block of 500 is in it
     # Rounding of some hundred rows times the condition of the columns.
-    assert streaming.difference_from_one_shot(factor, sets) < 1e-10
-    assert streaming.difference_from_one_shot(factor, sets[:2]) > 1e-6
+    assert stream.difference_from_one_shot(factor, sets) < 1e-10
+    assert stream.difference_from_one_shot(factor, sets[:2]) > 1e-6
 
 
-def test_the_stream_counts_its_snapshots(streaming, small):
-    found = streaming.stream(small, 2100)
+def test_the_stream_counts_its_snapshots(small):
+    found = stream.stream(small, 2100)
     assert found["snapshots"] == 2100
     assert found["snapshots_per_s"] > found["snapshots_per_s_with_drawing"] > 0.0
     assert found["all_rows_MB"] == pytest.approx(2100 * (15 + 4 + 15) * 8 / 1e6)
@@ -135,7 +114,7 @@ def test_the_stream_counts_its_snapshots(streaming, small):
 
 
 @pytest.mark.parametrize(("order", "constant"), [(4, False), (4, True), (2, True), (0, False)])
-def test_peers_lift_to_the_same_observables(peers, order, constant):
+def test_peers_lift_to_the_same_observables(order, constant):
     x = np.random.default_rng(0).normal(size=(7, 6))
     dictionary = observables.paper(order, constant_rotation=constant)
     wanted = np.asarray(jax.vmap(dictionary.lift)(x))
@@ -147,9 +126,7 @@ def test_peers_lift_to_the_same_observables(peers, order, constant):
     np.testing.assert_allclose(np.column_stack([x, *own]), wanted, rtol=1e-14)
 
 
-def test_a_peer_that_solves_the_same_problem_predicts_the_same(
-    benchmark, peers, small, monkeypatch
-):
+def test_a_peer_that_solves_the_same_problem_predicts_the_same(small, monkeypatch):
     def round_of_peers(python, path):
         with np.load(path) as read:
             return peers.measure({"pykoopman": LeastSquares(peers)}, dict(read))
@@ -168,7 +145,7 @@ def test_a_peer_that_solves_the_same_problem_predicts_the_same(
     assert 1e-3 < ours[0] < 0.5
 
 
-def test_peers_that_are_too_slow_are_timed_in_part(peers, monkeypatch):
+def test_peers_that_are_too_slow_are_timed_in_part(monkeypatch):
     monkeypatch.setattr(peers, "LIMIT", 1e-9)
     called = []
     spent, done = peers._loop(lambda *place: called.append(place), [(0, "a"), (0, "b")])
@@ -176,7 +153,7 @@ def test_peers_that_are_too_slow_are_timed_in_part(peers, monkeypatch):
     assert spent > 0.0
 
 
-def test_figures_are_none_where_the_peer_is_absent(benchmark, tmp_path):
+def test_figures_are_none_where_the_peer_is_absent(tmp_path):
     fits = {key: {"kjax": 2.0} for key in benchmark.KEYS}
     fits |= {"error": {"kjax": {"max": [0.1, 0.2, 0.3]}}, "many_timed": {}}
     rates = {"kjax": 200.0, "numpy_vectorised": 100.0, "numpy_loop": 2.0}
@@ -200,9 +177,7 @@ def test_figures_are_none_where_the_peer_is_absent(benchmark, tmp_path):
 
 
 @pytest.mark.parametrize("wrong", ["/nowhere/python", "true", sys.executable])
-def test_a_wrong_interpreter_is_one_line_and_exit_code_2(
-    wrong, benchmark, tmp_path, capsys, monkeypatch
-):
+def test_a_wrong_interpreter_is_one_line_and_exit_code_2(wrong, tmp_path, capsys, monkeypatch):
     def no_further():
         raise AssertionError("it went on")
 

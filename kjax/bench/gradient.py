@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from kjax.config import RunConfig, load_config
+from kjax.config.shipped import shipped_config
 from kjax.tuning import loop
 from kjax.tuning.optimise import build_objective
 from kjax.tuning.space import Space, build_space
@@ -52,7 +53,6 @@ KEYS = {
     "bound, friction as rows": BOUND,
     "bound, horizon through flight": CYCLE,
 }  # fmt: skip
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 CHECKED = 6  # scenarios with differences
 MANY = 256
 STEPS = (1e-5, 1e-6)  # of the differences; the better one counts, on either side of a kink
@@ -99,7 +99,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 def prepared(name: str) -> tuple[RunConfig, Space]:
     """Config and variables of a case."""
-    path = CONFIGS / f"{_FILES[name]}.toml"
+    path = shipped_config(f"{_FILES[name]}.toml")
     config = load_config(RunConfig, path, {"duration": SECONDS, **CASES[name]})
     return config, build_space(config, KEYS[name])
 

@@ -1,6 +1,6 @@
 """EDMD beside pykoopman, pykoop and NumPy: fits, their data, a stream; run by benchmark.py edmd.
 
-The peers need an interpreter of their own, which ``edmd_peers.py`` runs in: three rounds of it with
+The peers need an interpreter of their own, which ``peers.py`` runs in: three rounds of it with
 rounds of ours in between. Everything runs on one core with one thread.
 """
 
@@ -20,18 +20,26 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from edmd_data import PAPER, Setting, numpy_draw, numpy_loop, numpy_rollouts, sampler, setting
-from edmd_stream import STREAM, stream
 from tqdm import tqdm
 
 from kjax import cli
+from kjax.bench.edmd.data import (
+    PAPER,
+    Setting,
+    numpy_draw,
+    numpy_loop,
+    numpy_rollouts,
+    sampler,
+    setting,
+)
+from kjax.bench.edmd.stream import STREAM, stream
 from kjax.config import KoopmanConfig
 from kjax.koopman import edmd, models, observables, regression
 from kjax.koopman.dataset import Snapshots
 from kjax.types import STATE_NAMES
 
 PEERS = ("pykoopman", "pykoop")
-SCRIPT = Path(__file__).with_name("edmd_peers.py")
+SCRIPT = Path(__file__).with_name("peers.py")
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 ROUNDS = 3  # of every timing, in turn with those beside it; medians over all calls are reported

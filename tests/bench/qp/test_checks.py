@@ -1,7 +1,5 @@
 """What the QP benchmark counts: its judges judge, and they find the solvers right."""
 
-import importlib
-import sys
 from argparse import Namespace
 from pathlib import Path
 
@@ -11,18 +9,12 @@ import numpy as np
 import pytest
 
 from kjax import qp
+from kjax.bench.qp import checks, random_rows
 
-PUBLIC = Path(__file__).parents[3] / "shared" / "data" / "mpc_qpbenchmark"
-
-
-@pytest.fixture(scope="module")
-def checks(repository):
-    sys.path.insert(0, str(repository / "experiments"))
-    yield importlib.import_module("qp_checks")
-    sys.path.remove(str(repository / "experiments"))
+PUBLIC = Path(__file__).parents[4] / "shared" / "data" / "mpc_qpbenchmark"
 
 
-def test_the_judge_tells_a_minimiser_from_what_is_none(checks, random_qp):
+def test_the_judge_tells_a_minimiser_from_what_is_none(random_qp):
     H, q, lower, upper, x = random_qp(0)
     assert checks.independent_residual(H, q, lower, upper, x) < 1e-14
     for wrong in (x + 1e-3 * (upper - lower) * np.eye(12)[2], x + 1e-3, np.full(12, np.nan)):
@@ -32,7 +24,7 @@ def test_the_judge_tells_a_minimiser_from_what_is_none(checks, random_qp):
     assert checks.independent_residual(H, q, lower, upper, outside) == np.inf
 
 
-def test_no_random_problem_is_called_solved_that_is_not(checks, monkeypatch):
+def test_no_random_problem_is_called_solved_that_is_not(monkeypatch):
     monkeypatch.setattr(checks, "SIZES", (6, 20))
     monkeypatch.setattr(checks, "BATCH", 32)
     found = checks.random_solves(1)
@@ -41,7 +33,7 @@ def test_no_random_problem_is_called_solved_that_is_not(checks, monkeypatch):
     assert found["iteration_limit"] <= 4
 
 
-def test_a_solver_that_lies_is_found_out(checks, monkeypatch):
+def test_a_solver_that_lies_is_found_out(monkeypatch):
     monkeypatch.setattr(checks, "SIZES", (6,))
     monkeypatch.setattr(checks, "BATCH", 32)
 
@@ -53,7 +45,7 @@ def test_a_solver_that_lies_is_found_out(checks, monkeypatch):
     assert checks.random_solves(1)["wrong_solved"] > 0.9 * 32 * checks.TICKS
 
 
-def test_gradients_are_those_of_differences(checks, random_qp):
+def test_gradients_are_those_of_differences(random_qp):
     problems = [random_qp(seed)[:4] for seed in range(4)]
     H, q, lower, upper = (np.stack(part) for part in zip(*problems, strict=True))
     log = {
@@ -69,18 +61,13 @@ def test_gradients_are_those_of_differences(checks, random_qp):
 
 
 @pytest.mark.skipif(not PUBLIC.is_dir(), reason="the public problems are not beside the checkout")
-def test_public_problems_are_solved_to_1e_9(checks, monkeypatch):
+def test_public_problems_are_solved_to_1e_9(monkeypatch):
     monkeypatch.setattr(checks, "_median_us", lambda call: 1.0)  # no speed in tests
     found = checks.public_problems(PUBLIC, {})
     assert (found["problems"], found["solved_1e9"]) == (30, 30)
 
 
-@pytest.fixture(scope="module")
-def random_rows(checks):
-    return importlib.import_module("qp_random_rows")
-
-
-def test_no_random_problem_with_rows_has_a_wrong_answer(random_rows, monkeypatch):
+def test_no_random_problem_with_rows_has_a_wrong_answer(monkeypatch):
     monkeypatch.setattr(random_rows, "BATCH", 64)
     kinds = ("known", "infeasible", "unbounded", "linear")
     methods = ("auto", "active_set", "admm")
@@ -92,14 +79,14 @@ def test_no_random_problem_with_rows_has_a_wrong_answer(random_rows, monkeypatch
         assert entry["proven"] >= 60  # it does not merely refuse
 
 
-def test_linear_programs_drawn_from_a_known_point_have_the_cost_that_highs_finds(random_rows):
+def test_linear_programs_drawn_from_a_known_point_have_the_cost_that_highs_finds():
     problems = random_rows.draw(np.random.default_rng(3), "linear", 20, 5, 8)
     for i in range(20):
         best = random_rows.linear_program_cost(tuple(part[i] for part in problems.data))
         np.testing.assert_allclose(best, problems.least[i], rtol=0, atol=1e-6 * problems.terms[i])
 
 
-def test_a_lie_about_rows_is_found_out(random_rows, monkeypatch):
+def test_a_lie_about_rows_is_found_out(monkeypatch):
     monkeypatch.setattr(random_rows, "BATCH", 64)
 
     def lie(H, q, C, row_lower, row_upper, lower, upper, **options):

@@ -1,0 +1,116 @@
+"""Latency of the controller in the single-robot loop, beside its floors; start of the main job."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from kjax.config import RunConfig
+from kjax.sim.engines.mujoco import MujocoEngine, simulate
+from kjax.sim.episode import initial_state, metrics
+from kjax.sim.noise import noise_dim
+from kjax.sim.program import requests
+
+CALLS = 2000  # timed calls of each function
+WALK = 400  # ms of walking from which the timed inputs are taken
+
+
+def run(config: RunConfig, args: argparse.Namespace) -> dict[str, Any]:
+    """Latencies of a config's controller and, unless left out, the start-up times; prints them."""
+    result = controller_latency(config)
+    if not args.no_startup:
+        result |= start_up(args.config)
+    for key, value in result.items():
+        print(f"{key:32}{value:12.4g}")
+    return result
+
+
+def controller_latency(config: RunConfig) -> dict[str, Any]:
+    """Latency of the compiled calls on inputs from a walk, and of their floors [ms]."""
+    simulation = MujocoEngine(config)
+    states, sensed, data = _walk(simulation)
+    program = simulation.program(config)
+    noop = jax.jit(lambda state, sensed: (state + 1.0, sensed[:12] * 2.0))
+    calls: dict[str, Callable[[Any, Any], Any]] = {
+        "noop": noop,
+        "act": program.act,
+        "plan": program.plan,
+    }
+    times: dict[str, list[float]] = {name: [] for name in (*calls, "physics")}
+    for call in calls.values():
+        jax.block_until_ready(call(states[0], sensed[0]))
+    for i in range(CALLS):  # interleaved, so that all see the same machine
+        state, inputs = states[i % len(states)], sensed[i % len(sensed)]
+        for name, call in calls.items():
+            clock = time.perf_counter()
+            _, out = call(state, inputs)
+            np.asarray(out)
+            times[name].append(time.perf_counter() - clock)
+        clock = time.perf_counter()
+        mujoco.mj_step(simulation.model, data)
+        times["physics"].append(time.perf_counter() - clock)
+    result: dict[str, Any] = {}
+    for name, values in times.items():
+        result[f"{name}_ms_median"] = 1e3 * float(np.median(values))
+        result[f"{name}_ms_p99"] = 1e3 * float(np.percentile(values, 99))
+    result["act_over_noop"] = result["act_ms_median"] / result["noop_ms_median"]
+    result["plan_over_noop"] = result["plan_ms_median"] / result["noop_ms_median"]
+    runs = [metrics(simulate(simulation, seed=seed), config) for seed in range(3)]
+    result["realtime_factor"] = float(np.median([run["realtime_factor"] for run in runs]))
+    return result
+
+
+def _walk(simulation: MujocoEngine) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
+    """Controller states and sensor vectors along a walk, and the data at its end."""
+    model, config = simulation.model, simulation.config
+    program = simulation.program(config)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = initial_state(config, model)
+    mujoco.mj_forward(model, data)
+    states, sensed = [], []
+    noise = noise_dim(config.sim.base) * config.noise.enabled
+    state = None
+    for i in range(WALK):
+        now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(noise)])
+        state = program.init(now, requests(config)) if state is None else state
+        if i % 5 == 0:
+            state, _ = program.plan(state, now)
+        states.append(state)
+        sensed.append(now)
+        state, torque = program.act(state, now)
+        data.ctrl[:] = torque
+        mujoco.mj_step(model, data)
+    return states, sensed, data
+
+
+def start_up(config: str | None) -> dict[str, float]:
+    """Wall time of the whole main job with an empty and then a filled compile cache [s]."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "cache")}
+        command = [sys.executable, "-m", "kjax.studies.closed_loop", *([config] if config else [])]
+        seconds = []
+        for _ in range(2):
+            clock = time.perf_counter()
+            subprocess.run(
+                [*command, "--out", str(Path(folder) / "run")],
+                env=environment,
+                check=True,
+                capture_output=True,
+            )
+            seconds.append(time.perf_counter() - clock)
+        inner = json.loads((Path(folder) / "run" / "metrics.json").read_text(encoding="utf-8"))
+    return {
+        "first_run_s": seconds[0],
+        "second_run_s": seconds[1],
+        "second_run_realtime_factor": inner["realtime_factor"],
+    }

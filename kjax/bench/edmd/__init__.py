@@ -1,0 +1,1 @@
+"""EDMD beside pykoopman, pykoop and NumPy: fits, their data, a stream of snapshots."""

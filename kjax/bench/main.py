@@ -1,0 +1,81 @@
+"""Benchmarks: medians, with a floor measured in the same run.
+
+controller: latency of plan and act in the single-robot loop, beside an empty jitted call of the
+same signature and the bare physics step; real-time factor; first and second start of the main job.
+qp: the QP solvers on the QPs of closed loops, beside daqp, quadprog, OSQP, ProxQP, PIQP, Clarabel,
+qpSWIFT and qpax, as far as these are installed; single, in a scan and batched.
+simulation: closed loops per second on C MuJoCo and on MJX against the number of robots, beside the
+bare engines and a Python loop over single robots; compile time, memory, two processes against one.
+edmd: fits beside pykoopman and pykoop, the drawing of their data beside NumPy, 10^7 snapshots in a
+stream; --peers names a Python that has the two.
+gradient: gradients of a closed loop of 1 s on the rigid body, 200 QPs, against differences; time
+and memory for 256 scenarios.
+"""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from kjax import cli
+from kjax.config import RunConfig
+
+# Each has ``run(folder, args)``, and ``add_arguments(parser)`` where it has options of its own.
+# They are imported when they are asked for: not everybody has what they need.
+MODULES = {
+    "qp": "kjax.bench.qp.benchmark",
+    "simulation": "kjax.bench.simulation.benchmark",
+    "edmd": "kjax.bench.edmd.benchmark",
+    "gradient": "kjax.bench.gradient",
+}
+BENCHMARKS = ("controller", *MODULES)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line and run one benchmark; exit code 0 if it did."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and words[0] in ("-h", "--help"):
+        print(f"usage: benchmark.py {{{','.join(BENCHMARKS)}}} [options]\n\n{__doc__}")
+        return 0
+    if not words or words[0] not in BENCHMARKS:
+        cli.fail(f"which benchmark? one of: {', '.join(BENCHMARKS)}")
+    if words[0] == "controller":
+        controller_benchmark(words[1:])
+    else:
+        benchmark(words[0], words[1:])
+    return 0
+
+
+def controller_benchmark(words: Sequence[str]) -> None:
+    """The benchmark that takes the config of a run."""
+    parser = cli.build_parser(RunConfig, __doc__)
+    parser.prog = "benchmark.py controller"
+    parser.add_argument("--no-startup", action="store_true", help="leave out the start-up times")
+    config, args = cli.parse(RunConfig, parser, words)
+    args.out = args.out or Path("results") / "benchmark_controller"
+    folder = cli.output_folder(args, "benchmark")
+    cli.configure_jax(one_core=True)
+    from kjax.bench import controller
+
+    result = controller.run(config, args)
+    record = {"config": args.config, "provenance": cli.provenance(), **result}
+    cli.save_json(folder / "metrics.json", record)
+    print(f"results in {folder}/")
+
+
+def benchmark(name: str, words: Sequence[str]) -> None:
+    """One of ``MODULES``; leaves metrics.json, table.md and figure.png."""
+    module = importlib.import_module(MODULES[name])
+    parser = cli.script_parser(__doc__)
+    parser.prog = f"benchmark.py {name}"
+    parser.add_argument("--quick", action="store_true", help="less of it: to check the script")
+    if hasattr(module, "add_arguments"):
+        module.add_arguments(parser)
+    args = parser.parse_args(words)
+    args.out = args.out or Path("results") / f"benchmark_{name}"
+    folder = cli.output_folder(args, f"benchmark_{name}")
+    cli.configure_jax(one_core=name in ("qp", "edmd", "gradient"))
+    result = module.run(folder, args)
+    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
+    print((folder / "table.md").read_text(encoding="utf-8"))
+    print(f"results in {folder}/")

@@ -1,0 +1,1 @@
+"""The QP solvers beside their peers, on the QPs of closed loops."""

@@ -1,0 +1,1 @@
+"""Closed loops per second of both engines, beside the bare engines."""

@@ -1,0 +1,251 @@
+"""A lifting learned for control: prediction loss plus closed-loop cost through the QP.
+
+One network, one start, one set of data, trained twice: on many-step prediction alone, and with the
+cost of closed loops on the rigid body added, differentiated through every QP. Both then predict
+held-out rollouts, walk held-out scenarios on the rigid body, and walk in MuJoCo. Leaves
+metrics.json, table.md, figure.png and both models (for koopman.file) in the output folder.
+"""
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kjax import cli
+from kjax.config import CommandConfig, RunConfig, load_config
+from kjax.config.shipped import shipped_config
+from kjax.controllers.resolve import resolve
+from kjax.controllers.rigid_body import own_body
+from kjax.koopman import edmd
+from kjax.koopman.dataset import ranges_from_config, sample
+from kjax.prediction import families, learned, storage
+from kjax.robots import get_robot
+from kjax.sim.closed_cost import recording_costs
+from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.summary import summarise
+from kjax.tuning import loop
+from kjax.types import MODE_ALPHA, Mode
+
+DT, STEPS, ROLLOUTS = 1e-3, 100, 100
+TRAIN_SEED, HELD_OUT_SEED, HELD_OUT = 100, 200, 32
+MEMORY = 0.1  # s, of the derivatives through the closed loop
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line and run."""
+    args = _parse(argv)
+    folder = cli.output_folder(args, "learn_control")
+    cli.configure_jax()
+    clock = time.perf_counter()
+    data, test = draw(1, ROLLOUTS), draw(2, ROLLOUTS)
+    path = folder / "prediction.npz"
+    plain, how = train(args, data, None)
+    save(path, plain)
+    print(f"trained for prediction ({time.perf_counter() - clock:.0f} s)", flush=True)
+    config = short(args, path)
+    _, params = resolve(config)
+    train_on = loop.draw_scenarios(config, TRAIN_SEED, args.scenarios)
+    costs = costs_of(params, loop.build_loop(config, memory=MEMORY))
+    both, how_both = train(args, data, lambda model: args.weight * costs(model, train_on).mean())
+    save(folder / "control.npz", both)
+    print(f"trained for control as well ({time.perf_counter() - clock:.0f} s)", flush=True)
+    held_out = loop.draw_scenarios(config, HELD_OUT_SEED, HELD_OUT)
+    value, error = jax.jit(costs), jax.jit(prediction_errors)
+    models = {"prediction": (plain, how), "prediction and control": (both, how_both)}
+    result: dict[str, Any] = {"options": {k: v for k, v in vars(args).items() if k != "out"}}
+    for (name, (model, training)), file in zip(models.items(), (path, folder / "control.npz"),
+                                               strict=True):  # fmt: skip
+        each = np.asarray(value(model, held_out))
+        errors = np.asarray(error(model, test))
+        result[name] = {
+            "velocity_error_50ms_rms": float(np.sqrt((errors[:, 49, 3:5] ** 2).sum(-1).mean())),
+            "velocity_error_50ms_max": float(np.abs(errors[:, 49, 3:5]).max()),
+            "held_out_cost": float(each.mean()),
+            "held_out_cost_each": each,
+            "diverged": bool(training.diverged),
+            "loss": np.asarray(training.loss)[:: max(1, args.updates // 200)],
+            "mujoco": walk(args, file),
+        }
+        print(f"{name}: velocity 50 ms ahead {result[name]['velocity_error_50ms_rms']:.3g} m/s, "
+              f"held-out cost {result[name]['held_out_cost']:.3f}", flush=True)  # fmt: skip
+    result["own_linear_model"] = {"mujoco": walk(args, None)}
+    rng = np.random.default_rng(0)
+    rows = rng.integers(0, HELD_OUT, (2000, HELD_OUT))
+    first, second = (np.asarray(result[n]["held_out_cost_each"]) for n in models)
+    ratio = second[rows].mean(axis=1) / first[rows].mean(axis=1)
+    result["cost_ratio"] = float(second.mean() / first.mean())
+    result["cost_ratio_low"], result["cost_ratio_high"] = np.quantile(ratio, [0.025, 0.975])
+    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
+    (folder / "table.md").write_text(table(result), encoding="utf-8")
+    figure(result, folder / "figure.png")
+    print(table(result))
+    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+    return 0
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = cli.script_parser(__doc__.splitlines()[0])
+    parser.add_argument("--head", choices=("linear", "bilinear"), default="linear")
+    parser.add_argument("--updates", type=int, default=600, help="of Adam")
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=3e-3,
+        help="of Adam, in what each number moves by itself",
+    )
+    parser.add_argument("--scenarios", type=int, default=4, help="closed loops per update")
+    parser.add_argument("--seconds", type=float, default=0.6, help="length of each")
+    parser.add_argument("--weight", type=float, default=0.1, help="of the closed loops' cost")
+    parser.add_argument("--walks", type=int, default=16, help="seeds in MuJoCo")
+    args = parser.parse_args(argv)
+    for name in ("updates", "rate", "scenarios", "seconds", "weight", "walks"):
+        if not getattr(args, name) > 0:
+            cli.fail(f"--{name}: got {getattr(args, name)}, wanted more than 0")
+    return args
+
+
+def run_config(path: Path | None) -> RunConfig:
+    """The trot over ten steps of 20 ms, with a learned model or the paper's."""
+    own = {} if path is None else {"koopman.model": "learned", "koopman.file": str(path.resolve())}
+    return load_config(RunConfig, shipped_config("trot_velocity_long.toml"), own)
+
+
+def short(args: argparse.Namespace, path: Path) -> RunConfig:
+    """That of a scenario."""
+    command = CommandConfig(times=(0.0,), v_x=(0.0,))
+    return dataclasses.replace(run_config(path), duration=args.seconds, command=command)
+
+
+def draw(seed: int, rollouts: int) -> Any:
+    """Rollouts of the trot's rigid body on the ranges of the config."""
+    config = RunConfig()
+    body = jax.tree.map(
+        lambda a: a[Mode.TROT],
+        edmd.srb_params(own_body(config.srb, get_robot(config.robot).params)),
+    )
+    alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
+    ranges = ranges_from_config(config.koopman.dataset, vary_feet=False)
+    one = partial(sample, rollouts=rollouts, steps=STEPS, dt=DT)
+    return jax.jit(one)(jax.random.key(seed), body, alpha, ranges)
+
+
+def train(args: argparse.Namespace, data: Any, extra: Any) -> tuple[Any, learned.Training]:
+    """A model and how its training went; the same random numbers with and without ``extra``."""
+    fit = partial(
+        learned.train,
+        head=args.head,
+        updates=args.updates,
+        rate=args.rate,
+        window=50,
+        extra_loss=extra,
+    )
+    return jax.device_get(jax.jit(fit)(jax.random.key(3), data))
+
+
+def stacked(model: Any) -> Any:
+    """The trot's model for every contact mode: a trot meets no other."""
+    return jax.tree.map(lambda a: jnp.broadcast_to(a, (len(Mode), *jnp.shape(a))), model)
+
+
+def save(path: Path, model: Any) -> None:
+    """Write a model for koopman.file."""
+    spread = np.zeros((len(Mode), 6))
+    numbers = jax.device_get(stacked(model))
+    storage.save(path, storage.Stored("learned", DT, numbers, spread))
+
+
+def costs_of(params: Any, run: loop.Loop) -> Any:
+    """Function (model, scenarios) -> cost of every scenario."""
+
+    def costs(model: Any, scenarios: loop.Scenario) -> jax.Array:
+        fits = params.fits
+        fits = fits._replace(prediction=fits.prediction._replace(params=stacked(model)))
+        own = params._replace(fits=fits)
+        return jax.vmap(lambda s: loop.cost(get_robot().params, run(own, s)))(scenarios)
+
+    return costs
+
+
+def prediction_errors(model: Any, data: Any) -> jax.Array:
+    """Errors (rollouts, steps, 6) of predictions from the start."""
+    family = learned.learned(DT, model.head.A.shape[-1] - 7)
+
+    def one(states: jax.Array, inputs: jax.Array, feet: jax.Array) -> jax.Array:
+        start = families.Start(states[0], feet)
+        return (families.rollout(family, model, start, inputs) - states)[1:]
+
+    return jax.vmap(one)(*data)
+
+
+def walk(args: argparse.Namespace, path: Path | None) -> dict[str, Any]:
+    """The config's command in MuJoCo."""
+    config = run_config(path)
+    engine = BatchEngine(config)
+    recording = engine.run([dataclasses.replace(config, seed=s) for s in range(args.walks)])
+    if recording.interrupted:
+        raise KeyboardInterrupt
+    rows = summarise(recording.metrics())
+    keep = ("velocity_rmse_mps", "pitch_p95_deg")
+    return {
+        "runs": rows["runs"],
+        "falls": rows["falls"],
+        "cost_median": float(np.median(recording_costs(recording))),
+        **{key: rows[key] for key in keep if key in rows},
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown."""
+    lines = [
+        "| trained for | velocity error, 50 ms, rms [m/s] | held-out cost | MuJoCo: fell | "
+        "RMSE of v_x [m/s] | cost |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in ("prediction", "prediction and control", "own_linear_model"):
+        entry = result[name]
+        walked = entry["mujoco"]
+        rmse = walked.get("velocity_rmse_mps")
+        ahead = (
+            f"{entry['velocity_error_50ms_rms']:.3g} | {entry['held_out_cost']:.3f}"
+            if "held_out_cost" in entry else "- | -"
+        )  # fmt: skip
+        lines.append(
+            f"| {name.replace('_', ' ')} | {ahead} | {walked['falls']} of {walked['runs']} | "
+            + (f"{rmse['median']:.4f} ({rmse['worst']:.4f})" if rmse else "-")
+            + f" | {walked['cost_median']:.3f} |"
+        )
+    lines.append(
+        f"\nHeld-out cost with control over without: {result['cost_ratio']:.3f} "
+        f"({result['cost_ratio_low']:.3f} to {result['cost_ratio_high']:.3f})"
+    )
+    return "\n".join(lines) + "\n"
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Losses; cost of every held-out scenario, with control against without."""
+    fig, (curve, pairs) = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
+    names = ("prediction", "prediction and control")
+    for name in names:
+        loss = np.asarray(result[name]["loss"], float)
+        every = result["options"]["updates"] / len(loss)
+        curve.plot(np.arange(len(loss)) * every, loss, lw=0.8, label=name)
+    curve.set(xlabel="update", ylabel="training loss", yscale="log")
+    curve.legend(fontsize=7, title="trained for", title_fontsize=7)
+    first, second = (np.asarray(result[n]["held_out_cost_each"]) for n in names)
+    top = max(first.max(), second.max())
+    pairs.plot([0, top], [0, top], "k--", lw=0.8)
+    pairs.plot(first, second, "o", ms=3)
+    pairs.set(xlabel=f"cost, trained for {names[0]}", ylabel=f"cost, for {names[1]}",
+              title="held-out scenarios", aspect="equal")  # fmt: skip
+    for ax in (curve, pairs):
+        ax.grid(alpha=0.3)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)

@@ -1,0 +1,1 @@
+"""What the paper publishes, beside our numbers and targets."""

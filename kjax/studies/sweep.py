@@ -1,0 +1,177 @@
+"""Walk a whole sweep of closed loops: a grid or a random sample of configs, times seeds.
+
+Leaves sweep.nc (labelled, xarray), summary.json and figure.png of what its [figure] asks for, and
+in cache/ a file per chunk, in the output folder. Run again, it goes on where it stopped;
+finished, it only draws.
+"""
+
+import json
+import time
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from kjax import cli
+from kjax.config import ConfigError, SweepConfig, load_config, to_dict
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line and run; exit code 0 if the sweep is finished."""
+    sweep, args = _parse(argv)
+    folder = args.out or Path("results") / "sweeps" / Path(args.config).stem
+    if args.draw:
+        draw(sweep, folder, args.config)
+        return 0
+    cli.configure_jax(parallel=sweep.engine == "mjx")
+    jax.config.update("jax_enable_x64", sweep.precision == "float64")
+    barrier = start_processes(args)
+    process, processes = jax.process_index(), jax.process_count()
+
+    from kjax.runs.cache import CacheError
+    from kjax.runs.sweeps.runner import run_sweep
+
+    clock = time.perf_counter()
+    try:
+        dataset = run_sweep(
+            sweep,
+            Path(args.config),
+            folder,
+            threads=args.threads,
+            process=process,
+            processes=processes,
+            barrier=barrier,
+            fresh=args.restart,
+        )
+    except (ConfigError, CacheError) as error:
+        cli.fail(str(error))
+    except KeyboardInterrupt:
+        print(f"stopped; finished chunks are kept in {folder}/, run again to go on")
+        return 130
+    if dataset is None:
+        return 0
+    try:
+        report(dataset, sweep, folder)
+    except ValueError as error:
+        cli.fail(f"{args.config}: {error}")
+    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+    return 0
+
+
+def _parse(argv: Sequence[str] | None) -> tuple[SweepConfig, Namespace]:
+    """The sweep, with what the command line says instead of its file, and the other options."""
+    parser = cli.script_parser(__doc__.splitlines()[0])
+    parser.add_argument("config", help="TOML file of a sweep, e.g. configs/sweeps/trot_rough.toml")
+    parser.add_argument("--engine", help="instead of the file's: mujoco_batch, mjx, mujoco")
+    parser.add_argument("--torques", choices=("every_step", "held"), help="instead of the file's")
+    parser.add_argument("--seeds", type=int, help="episodes per point, instead of the file's")
+    parser.add_argument("--chunk", type=int, help="robots at once, instead of the file's")
+    parser.add_argument("--threads", type=int, help="of the C engine (default: one per core)")
+    parser.add_argument(
+        "--restart", action="store_true", help="drop all results that the folder holds"
+    )
+    parser.add_argument("--draw", action="store_true",
+                        help="only draw the sweep.nc of a finished sweep")  # fmt: skip
+    parser.add_argument("--distributed", action="store_true",
+                        help="one of several processes, as Slurm or Open MPI tell")  # fmt: skip
+    parser.add_argument("--coordinator", metavar="HOST:PORT",
+                        help="the same by hand: address of process 0")  # fmt: skip
+    parser.add_argument("--processes", type=int, help="their number")
+    parser.add_argument("--process", type=int, help="number of this one, from 0 on")
+    args = parser.parse_args(argv)
+    for name in ("seeds", "chunk", "threads"):
+        if getattr(args, name) is not None and getattr(args, name) < 1:
+            cli.fail(f"--{name}: got {getattr(args, name)}, wanted at least 1")
+    given = {name: getattr(args, name) for name in ("engine", "torques", "seeds", "chunk")}
+    try:
+        sweep = load_config(
+            SweepConfig, args.config, {k: v for k, v in given.items() if v is not None}
+        )
+    except ConfigError as error:
+        cli.fail(str(error))
+    return sweep, args
+
+
+def start_processes(args: Namespace) -> Any:
+    """Join the other processes, if there are any; a barrier for them, or ``None``."""
+    by_hand = [args.coordinator, args.processes, args.process]
+    if not args.distributed and all(value is None for value in by_hand):
+        return None
+    if not args.distributed and any(value is None for value in by_hand):
+        cli.fail("--coordinator, --processes and --process: wanted all three, or --distributed")
+    try:
+        if args.distributed:
+            jax.distributed.initialize()
+        else:
+            jax.distributed.initialize(args.coordinator, args.processes, args.process)
+    except (RuntimeError, ValueError) as error:
+        cli.fail(f"jax.distributed: {str(error).splitlines()[0]}")
+    from jax.experimental import multihost_utils
+
+    return multihost_utils.sync_global_devices
+
+
+def draw(sweep: SweepConfig, folder: Path, config: str) -> None:
+    """Figure and summary of a finished sweep, from its dataset alone."""
+    import xarray as xr
+
+    try:
+        with xr.open_dataset(folder / "sweep.nc") as dataset:
+            require_sweep(dataset, sweep, folder)
+            report(dataset.load(), sweep, folder)
+    except (OSError, ValueError) as error:
+        cli.fail(f"--draw: {folder / 'sweep.nc'} with {config}: {error}")
+
+
+# What decides which cases a sweep has, but for the number of their seeds.
+WALKED = ("base", "set", "sample", "sample_seed")
+VALUES = ("values", "low", "high", "count")
+
+
+def require_sweep(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
+    """End the program where the folder holds another sweep; figure, units and labels may differ."""
+
+    def walked(spec: dict[str, Any]) -> Any:
+        axes = {name: [axis[key] for key in VALUES] for name, axis in spec["axes"].items()}
+        return json.loads(json.dumps([axes, *(spec[key] for key in WALKED)]))
+
+    try:
+        held = walked(json.loads(dataset.attrs["sweep"]))
+    except (KeyError, TypeError, ValueError):
+        cli.fail(f"--draw: {folder / 'sweep.nc'} does not say which sweep it is of")
+    if held != walked(to_dict(sweep)):
+        cli.fail(
+            f"--draw: {folder / 'sweep.nc'} holds another sweep: its base, axes or keys differ"
+        )
+
+
+def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
+    """Draw the figure and print what came out, in one line."""
+    from kjax.viz.sweep_plots import sweep_figure, sweep_summary
+
+    sweep_figure(dataset, sweep, folder / "figure.png")
+    record = {
+        "provenance": json.loads(dataset.attrs["provenance"]),
+        **sweep_summary(dataset, sweep),
+    }
+    cli.save_json(folder / "summary.json", record)
+    print(summary_line(dataset))
+
+
+def summary_line(dataset: Any) -> str:
+    """What came out of all episodes, and what counts as a success."""
+    from kjax.viz.sweep_plots import criterion, success
+
+    good, fell = success(dataset), dataset["fell"] > 0
+    text = f"{good.size} episodes, {int(good.sum())} succeeded ({criterion(dataset)}), "
+    text += f"{int(fell.sum())} fell"
+    if "velocity_rmse_mps" in dataset and not bool(fell.all()):
+        median = float(dataset["velocity_rmse_mps"].where(~fell).median())
+        text += f"; median RMSE of the others {median:.4f} m/s"
+    return text
+
+
+if __name__ == "__main__":
+    cli.run(main)

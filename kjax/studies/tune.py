@@ -1,0 +1,380 @@
+"""Tune the controller by gradients through its closed loop, then see what MuJoCo says.
+
+Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body on legs
+without mass, the controller's own plan, 200 QPs a second), with others held out. With --baseline
+CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time; with --refine it
+goes on from the descent's result. All results, the start and the config's own numbers then walk the
+config's whole command in MuJoCo on other seeds.
+
+Leaves tuned.toml, metrics.json, table.md and figure.png in the output folder. The state is kept
+there as well: the same command goes on after Ctrl-C or a kill.
+"""
+
+import dataclasses
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from tqdm import tqdm
+
+from kjax import cli
+from kjax.config import CommandConfig, RunConfig
+from kjax.runs.cache import Cache, open_cache
+from kjax.sim.closed_cost import recording_costs
+from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.summary import summarise
+from kjax.tuning import loop
+from kjax.tuning.optimise import build_objective, descend
+from kjax.tuning.space import TUNABLE, Space, Variables, build_space, shown, tuned_config
+
+TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
+POPULATION_SEEDS = 4  # MuJoCo episodes per candidate of the baseline
+SIGMA = 0.5  # of a first population, about a factor of 1.6
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line and run; exit code 0 if all went well."""
+    config, args = _parse(argv)
+    cli.configure_jax()
+    folder = cli.output_folder(args, "tune")
+    try:
+        tune(config, args, folder)
+    except KeyboardInterrupt:
+        print(f"interrupted; the same command goes on from what {folder}/ holds", file=sys.stderr)
+        return 130
+    return 0
+
+
+def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
+    """Descend, search, compare; leaves everything in the folder."""
+    short, space = shortened(config, args), None
+    try:
+        space = build_space(short, args.keys)
+    except ValueError as error:
+        cli.fail(f"--{error}" if str(error).startswith("keys") else str(error))
+    begin = worsened(space, args.worsen, args.worsen_seed)
+    cache = open_cache(folder, Path(__file__))
+    key = cache.key(short, _settings(args))
+    cache.folder.mkdir(exist_ok=True)
+    train, held_out = (
+        loop.draw_scenarios(short, seed, count, speeds=args.speeds, pieces=args.pieces)
+        for seed, count in ((TRAIN_SEED, args.scenarios), (HELD_OUT_SEED, args.held_out))
+    )
+    objective = build_objective(short, space, memory=args.memory)
+    look = jax.jit(lambda z: jax.vmap(objective, (None, 0))(z, held_out).mean())
+    own_cost, begin_cost = float(look(space.start)), float(look(begin))
+    print(f"cost on {args.held_out} held-out scenarios: the config's own numbers {own_cost:.3f}, "
+          f"the start {begin_cost:.3f}", flush=True)  # fmt: skip
+    with tqdm(total=args.updates, unit="update", disable=None) as bar:
+
+        def show(number: int, value: float, best: float) -> None:
+            bar.n = number
+            bar.set_postfix_str(f"cost {value:.3f}, held out {best:.3f}")
+
+        try:
+            result = descend(
+                objective, space, train, held_out, start=begin, updates=args.updates,
+                rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
+                checkpoint=cache.path(key, ".npz"), identity=key, on_update=show,
+            )  # fmt: skip
+        except ValueError as error:
+            cli.fail(str(error))
+    print(f"descent: {len(result.cost)} updates in {result.seconds:.0f} s, held-out cost "
+          f"{result.best_cost:.3f} after update {result.best_update} (ended by: {result.stopped})",
+          flush=True)  # fmt: skip
+    sets = {"own": space.start, "start": begin, "gradient": result.best}
+    searches: dict[str, dict[str, Any]] = {}
+    for name, first in evolutions(args, begin, result.best).items():
+        own = cache.key(key, name, [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(first)])
+        searches[name] = evolve(short, space, first, args, result.seconds, cache, own)
+        sets[name] = searches[name]["best"]
+        print(f"{name}: {searches[name]['generations']} generations of "
+              f"{searches[name]['population']} in MuJoCo in {searches[name]['seconds']:.0f} s",
+              flush=True)  # fmt: skip
+    costs = {name: float(look(z)) for name, z in sets.items()}
+    verdict = {name: walk(config, space.overrides(z), args.seeds) for name, z in sets.items()}
+    cli.save_config(folder / "tuned.toml", tuned_config(config, space.overrides(result.best)))
+    record = {
+        "provenance": cli.provenance(),
+        "keys": list(args.keys),
+        "worsen": args.worsen,
+        "scenarios": {"train": args.scenarios, "held_out": args.held_out, "seconds": args.seconds},
+        "held_out_cost": costs,
+        "cost_over_own": {name: value / costs["own"] for name, value in costs.items()},
+        "values": {name: space.overrides(z) for name, z in sets.items()},
+        "descent": {
+            "updates": len(result.cost), "seconds": result.seconds, "stopped": result.stopped,
+            "best_update": result.best_update, "cost": result.cost,
+            "checks": result.checks, "held_out": result.held_out,
+        },
+        "searches": {
+            name: {k: v for k, v in found.items() if k != "best"}
+            for name, found in searches.items()
+        },
+        "mujoco": verdict,
+    }  # fmt: skip
+    cli.save_json(folder / "metrics.json", record)
+    text = table(record)
+    (folder / "table.md").write_text(text, encoding="utf-8")
+    runs = traces(short, space, sets, held_out)
+    figure(record, runs, short, folder / "figure.png")
+    print(text)
+    print(f"results in {folder}/")
+    if not result.healthy:
+        cli.fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
+
+
+def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
+    parser = cli.build_parser(RunConfig, __doc__.splitlines()[0])
+    parser.add_argument(
+        "--keys",
+        nargs="+",
+        metavar="KEY",
+        help=f"what to tune; the gait's weights by default; of: {', '.join(shown(TUNABLE))}",
+    )
+    parser.add_argument("--scenarios", type=int, default=16, help="to descend on")
+    parser.add_argument("--held-out", type=int, default=32, help="to choose the best point on")
+    parser.add_argument("--seconds", type=float, default=3.0, help="length of a scenario")
+    parser.add_argument("--pieces", type=int, default=2, help="velocities in a scenario's command")
+    parser.add_argument("--updates", type=int, default=150, help="of Adam, at most")
+    parser.add_argument("--rate", type=float, default=0.15, help="of Adam, in the log of a weight")
+    parser.add_argument("--patience", type=int, default=40, help="updates without improvement")
+    parser.add_argument("--minutes", type=float, default=15.0, help="wall time, at most")
+    parser.add_argument(
+        "--worsen",
+        type=float,
+        default=1.0,
+        metavar="FACTOR",
+        help="begin with every number off by this factor, up or down",
+    )
+    parser.add_argument("--worsen-seed", type=int, default=0, help="of which are up, which down")
+    parser.add_argument(
+        "--memory",
+        type=float,
+        default=0.1,
+        help="of the derivatives [s]; inf for the true ones, which a chaotic loop makes useless",
+    )
+    parser.add_argument(
+        "--baseline",
+        action="store_true",
+        help="CMA-ES in MuJoCo from the same start, for the same time",
+    )
+    parser.add_argument(
+        "--refine",
+        action="store_true",
+        help="CMA-ES in MuJoCo from where the descent ends, likewise",
+    )
+    parser.add_argument("--seeds", type=int, default=16, help="of the walks in MuJoCo at the end")
+    config, args = cli.parse(RunConfig, parser, argv)
+    args.speeds = min(config.command.v_x), max(config.command.v_x)
+    for name in ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
+                 "minutes", "worsen", "memory", "seeds"):  # fmt: skip
+        if not getattr(args, name) > 0:
+            cli.fail(f"--{name.replace('_', '-')}: got {getattr(args, name)}, wanted more than 0")
+    if config.sim.base != "planar":
+        cli.fail(f"sim.base: got '{config.sim.base}', wanted 'planar': the plant is planar")
+    if args.keys is None:
+        args.keys = _own_keys(config)
+    return config, args
+
+
+def _own_keys(config: RunConfig) -> tuple[str, ...]:
+    """Weights of the config's gait, and its foothold gain where it has one of its own."""
+    name = config.gait.names[0]
+    own = config.gaits[name]
+    keys = [
+        f"gaits.{name}.{key}"
+        for key in ("Q", "R", "foothold_gain")
+        if getattr(own, key) is not None
+    ]
+    return tuple(keys) or ("lmpc.Q", "lmpc.R")
+
+
+def _settings(args: Namespace) -> list[Any]:
+    """Options that the descent depends on."""
+    names = ("keys", "scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
+             "worsen", "worsen_seed", "memory", "speeds")  # fmt: skip
+    return [getattr(args, name) for name in names]
+
+
+def shortened(config: RunConfig, args: Namespace) -> RunConfig:
+    """The config of a scenario."""
+    command = CommandConfig(times=(0.0,), v_x=(0.0,))
+    return dataclasses.replace(config, duration=args.seconds, command=command)
+
+
+def worsened(space: Space, factor: float, seed: int) -> Variables:
+    """The config's variables, each number off by a factor, up or down at random."""
+    rng = np.random.default_rng(seed)
+    out = {}
+    for key, one in space.start.items():
+        if space.kinds[key].unit is None:
+            out[key] = one + np.log(factor) * rng.choice([-1.0, 1.0], np.shape(one))
+        else:
+            out[key] = one / factor
+    return space.inside(out)
+
+
+def evolutions(args: Namespace, begin: Variables, tuned: Variables) -> dict[str, Variables]:
+    """What CMA-ES is asked to do: names, and where it begins."""
+    asked = {"CMA-ES": begin} if args.baseline else {}
+    return asked | ({"gradient, then CMA-ES": tuned} if args.refine else {})
+
+
+def evolve(
+    config: RunConfig, space: Space, begin: Variables, args: Namespace, seconds: float,
+    cache: Cache, key: str,
+) -> dict[str, Any]:  # fmt: skip
+    """CMA-ES on batches of MuJoCo walks for some wall time [s]; kept after every generation.
+
+    What is kept is the costs and times of the generations: the search draws the same candidates
+    from the same seed, and is told again what they cost.
+    """
+    import cma
+
+    leaves, tree = jax.tree.flatten(begin)
+    sizes = np.cumsum([np.size(leaf) for leaf in leaves])[:-1]
+
+    def unflat(vector: np.ndarray) -> Variables:
+        parts = np.split(np.asarray(vector), sizes)
+        shaped = [p.reshape(np.shape(a)) for p, a in zip(parts, leaves, strict=True)]
+        return space.inside(jax.tree.unflatten(tree, shaped))
+
+    mean = np.concatenate([np.ravel(leaf) for leaf in leaves])
+    search = cma.CMAEvolutionStrategy(mean, SIGMA, {"seed": 1, "verbose": -9})
+    costs: list[np.ndarray] = []
+    spent: list[float] = []
+    kept = cache.arrays(key)
+    if kept is not None:
+        for row, seconds_of_it in zip(kept["costs"], kept["seconds"], strict=True):
+            search.tell(search.ask(), row.tolist())
+            costs.append(row)
+            spent.append(float(seconds_of_it))
+    walks = mujoco_scenarios(config, args)
+    engine = BatchEngine(walks[0], torques="held")
+    with tqdm(total=round(seconds), unit="s", desc="CMA-ES", disable=None) as bar:
+        while sum(spent) < seconds and not search.stop():
+            clock = time.perf_counter()
+            asked = search.ask()
+            candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
+            recording = engine.run([
+                dataclasses.replace(c, command=w.command, seed=w.seed, sim=w.sim)
+                for c in candidates for w in walks
+            ])  # fmt: skip
+            if recording.interrupted:
+                raise KeyboardInterrupt
+            row = recording_costs(recording).reshape(len(asked), len(walks)).mean(axis=1)
+            search.tell(asked, row.tolist())
+            costs.append(row)
+            spent.append(time.perf_counter() - clock)
+            cache.add_arrays(key, {"costs": np.stack(costs), "seconds": np.array(spent)})
+            bar.n = min(round(sum(spent)), bar.total)
+            bar.set_postfix_str(f"cost {min(one.min() for one in costs):.3f}")
+    return {
+        "best": unflat(search.result.xfavorite if costs else mean),
+        "generations": len(costs),
+        "population": search.popsize,
+        "episodes": len(costs) * search.popsize * len(walks),
+        "seconds": sum(spent),
+        "cost": [float(one.min()) for one in costs],
+    }
+
+
+def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
+    """What a candidate of the baseline walks: the descent's commands, in MuJoCo."""
+    rng = np.random.default_rng(TRAIN_SEED)
+    low, high = args.speeds
+    times = tuple(float(i) * args.seconds / args.pieces for i in range(args.pieces))
+    return [
+        dataclasses.replace(
+            config,
+            seed=TRAIN_SEED + i,
+            sim=dataclasses.replace(config.sim, contacts="feet"),
+            command=CommandConfig(
+                times=times, v_x=tuple(map(float, rng.uniform(low, high, args.pieces)))
+            ),
+        )
+        for i in range(POPULATION_SEEDS)
+    ]
+
+
+def walk(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, Any]:
+    """The config's whole command in MuJoCo with some values, torques at every step."""
+    chosen = tuned_config(config, overrides)
+    configs = [dataclasses.replace(chosen, seed=seed) for seed in range(seeds)]
+    recording = BatchEngine(chosen).run(configs)
+    if recording.interrupted:
+        raise KeyboardInterrupt
+    rows = summarise(recording.metrics())
+    keep = ("velocity_rmse_mps", "pitch_p95_deg", "pitch_max_deg", "foot_slip_m",
+            "torque_saturation_fraction")  # fmt: skip
+    costs = recording_costs(recording)
+    return {
+        "runs": rows["runs"],
+        "falls": rows["falls"],
+        "cost_median": float(np.median(costs)),
+        **{key: rows[key] for key in keep if key in rows},
+    }
+
+
+def traces(
+    config: RunConfig, space: Space, sets: dict[str, Variables], scenarios: loop.Scenario
+) -> dict[str, Any]:
+    """The first held-out scenario with every set of numbers."""
+    run = jax.jit(loop.build_loop(config))
+    one = jax.tree.map(lambda a: a[0], scenarios)
+    return {name: jax.device_get(run(space.params(z), one)) for name, z in sets.items()}
+
+
+def table(record: dict[str, Any]) -> str:
+    """Markdown."""
+    lines = [
+        "| numbers | held-out cost, rigid body | MuJoCo: fell | RMSE of v_x [m/s] | "
+        "pitch, 95 % [deg] | cost |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, entry in record["mujoco"].items():
+
+        def cell(key: str, entry: dict[str, Any] = entry) -> str:
+            if key not in entry:
+                return "-"
+            return f"{entry[key]['median']:.3g} ({entry[key]['worst']:.3g})"
+
+        lines.append(
+            f"| {name} | {record['held_out_cost'][name]:.3f} | {entry['falls']} of "
+            f"{entry['runs']} | {cell('velocity_rmse_mps')} | {cell('pitch_p95_deg')} | "
+            f"{entry['cost_median']:.3f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path: Path) -> None:
+    """Loss curve; one held-out scenario before and after."""
+    fig, (curve, speed, pitch) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
+    descent, costs = record["descent"], record["held_out_cost"]
+    curve.plot(descent["cost"], lw=0.8, label="training scenarios")
+    curve.plot(descent["checks"], descent["held_out"], "o-", ms=2.5, label="held out")
+    curve.axhline(costs["own"], color="k", ls="--", lw=0.8, label="config's own numbers")
+    curve.set(xlabel="update of Adam", ylabel="cost [-]", yscale="log")
+    curve.legend(fontsize=7)
+    dt = config.lmpc.control_dt
+    first = next(iter(runs.values()))
+    time_axis = np.arange(len(first.x)) * dt
+    speed.plot(time_axis, first.wanted[:, 0], "k--", lw=0.9, label="reference")
+    for name, run in runs.items():
+        shown = np.where(run.alive[:, None], run.x, np.nan)
+        speed.plot(time_axis, shown[:, 3], lw=0.9, label=name)
+        pitch.plot(time_axis, np.degrees(shown[:, 2]), lw=0.9, label=name)
+    speed.set(xlabel="time [s]", ylabel="v_x [m/s]", title="a held-out scenario, rigid body")
+    pitch.set(xlabel="time [s]", ylabel="pitch [deg]")
+    speed.legend(fontsize=7)
+    for ax in (curve, speed, pitch):
+        ax.grid(alpha=0.3)
+    fig.savefig(path, dpi=120)
+    plt.close(fig)

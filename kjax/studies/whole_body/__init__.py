@@ -1,0 +1,1 @@
+"""What a rigid body misses of the whole robot, learned from recorded episodes."""
