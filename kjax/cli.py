@@ -91,7 +91,7 @@ def parse_study(
       argv: words of the command line; of this process if ``None``.
       description: of the script.
       names: of its parts, for ``--only``.
-      counts: options that are whole numbers from 1 on: default and help.
+      counts: options that are integers from 1 on: default and help.
       base: default of ``--base``.
       quick: help of ``--quick``.
       default_out: folder in results/.

@@ -26,6 +26,7 @@ from kjax.dynamics import srb_planar  # noqa: E402
 from kjax.prediction.features import affine, clock_history  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
 from kjax.sim.engines.mujoco_batch import BatchEngine  # noqa: E402
+from kjax.sim.resolve import batch_spec, resolve_episodes  # noqa: E402
 from kjax.sysid import open_loop, whole_body  # noqa: E402
 from kjax.sysid.transitions import Episode, split, transitions  # noqa: E402
 
@@ -54,7 +55,7 @@ configs = [
     )
     for seed in range(ROBOTS)
 ]
-recording = BatchEngine(configs[0], torques="held").run(configs)
+recording = BatchEngine(batch_spec(configs[0]), torques="held").run(resolve_episodes(configs))
 print(f"{ROBOTS} episodes of 3 s, {int(recording.fell.sum())} falls, {recording.wall_time:.0f} s")
 log = recording.log
 episodes = [

@@ -21,9 +21,8 @@ from kjax.controllers.controller import build_controller
 from kjax.controllers.params import condense, with_params
 from kjax.controllers.resolve import resolve
 from kjax.robots import get_robot
-from kjax.sim.episode import initial_state
 from kjax.sim.observe import build_observe, find_addresses
-from kjax.sim.scene import build_model
+from kjax.sim.resolve import build_scene, start_state
 
 config = load_config(RunConfig, None, {"command.times": [0.0, 0.5], "command.v_x": [0.0, 0.4]})
 
@@ -45,11 +44,11 @@ plan, act = jax.jit(controller.plan), jax.jit(controller.act)
 
 # %%
 robot = get_robot(config.robot)
-model = build_model(robot, config.sim, config.terrain)
+model = build_scene(config)
 observe, at = build_observe(robot, model, 5.0), find_addresses(robot, model)
 actuator = at.actuator.reshape(-1)
 data = mujoco.MjData(model)
-data.qpos[:], data.qvel[:] = initial_state(config, model)
+data.qpos[:], data.qvel[:] = start_state(config, model)
 mujoco.mj_forward(model, data)
 
 

@@ -8,7 +8,7 @@
 # # Tuning a bound from bad weights, by gradients through the closed loop
 #
 # `kjax.tuning` walks the controller's own `plan` (phase clock, footholds, lift, QP) on a rigid
-# body, 200 QPs per second; the whole run is a differentiable function of the controller's numbers.
+# body, 200 QPs per second; the run is a differentiable function of the controller's parameters.
 # Here every weight of a bound is off by a factor of ten, up or down, and Adam finds its way back.
 
 # %%

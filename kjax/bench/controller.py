@@ -17,9 +17,11 @@ import numpy as np
 
 from kjax.config import RunConfig
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.episode import initial_state, metrics
+from kjax.sim.episode import Episode, initial_state
+from kjax.sim.metrics import metrics
 from kjax.sim.noise import noise_dim
 from kjax.sim.program import requests
+from kjax.sim.resolve import resolve_episode
 
 CALLS = 2000  # timed calls of each function
 WALK = 400  # ms of walking from which the timed inputs are taken
@@ -37,9 +39,10 @@ def run(config: RunConfig, args: argparse.Namespace) -> dict[str, Any]:
 
 def controller_latency(config: RunConfig) -> dict[str, Any]:
     """Latency of the compiled calls on inputs from a walk, and of their floors [ms]."""
-    simulation = MujocoEngine(config)
-    states, sensed, data = _walk(simulation)
-    program = simulation.program(config)
+    episode = resolve_episode(config)
+    simulation = MujocoEngine(episode.spec)
+    states, sensed, data = _walk(simulation, episode)
+    program = simulation.program(episode)
     noop = jax.jit(lambda state, sensed: (state + 1.0, sensed[:12] * 2.0))
     calls: dict[str, Callable[[Any, Any], Any]] = {
         "noop": noop,
@@ -65,24 +68,29 @@ def controller_latency(config: RunConfig) -> dict[str, Any]:
         result[f"{name}_ms_p99"] = 1e3 * float(np.percentile(values, 99))
     result["act_over_noop"] = result["act_ms_median"] / result["noop_ms_median"]
     result["plan_over_noop"] = result["plan_ms_median"] / result["noop_ms_median"]
-    runs = [metrics(simulate(simulation, seed=seed), config) for seed in range(3)]
+    runs = [
+        metrics(simulate(simulation, resolve_episode(config, seed=seed)), episode.goal)
+        for seed in range(3)
+    ]
     result["realtime_factor"] = float(np.median([run["realtime_factor"] for run in runs]))
     return result
 
 
-def _walk(simulation: MujocoEngine) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
+def _walk(
+    simulation: MujocoEngine, episode: Episode
+) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
     """Controller states and sensor vectors along a walk, and the data at its end."""
-    model, config = simulation.model, simulation.config
-    program = simulation.program(config)
+    model, scene = simulation.model, simulation.spec.scene
+    program = simulation.program(episode)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(config, model)
+    data.qpos[:], data.qvel[:] = initial_state(episode.start, model, simulation.addresses)
     mujoco.mj_forward(model, data)
     states, sensed = [], []
-    noise = noise_dim(config.sim.base) * config.noise.enabled
+    noise = noise_dim(scene.base) * scene.noise
     state = None
     for i in range(WALK):
         now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(noise)])
-        state = program.init(now, requests(config)) if state is None else state
+        state = program.init(now, requests(episode)) if state is None else state
         if i % 5 == 0:
             state, _ = program.plan(state, now)
         states.append(state)

@@ -1,4 +1,4 @@
-"""What the sections share: strictness, kinds of numbers, and checks across keys."""
+"""What the sections share: strictness, ranges and units, and checks across keys."""
 
 import difflib
 import itertools

@@ -91,7 +91,7 @@ class FitStudyConfig:
     """The fit study of the paper's Fig. 3."""
 
     robot: str = "go1"
-    """Whose numbers srb takes where it gives none [-]."""
+    """Whose mass, inertia and feet srb takes where it gives none [-]."""
     srb: SrbConfig = SrbConfig()
     """Single rigid body."""
     koopman: KoopmanConfig = KoopmanConfig()

@@ -21,7 +21,7 @@ class TerrainConfig:
     start: Positive = 0.8
     """Where the field begins, measured from the robot's start [m]."""
     end: Positive = 2.6
-    """Where it ends [m]."""
+    """Its far end [m]."""
     height_min: Positive = 0.05
     """Lowest obstacle, or rise of a step [m]."""
     height_max: Positive = 0.07

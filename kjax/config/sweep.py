@@ -13,7 +13,7 @@ class AxisConfig:
     """One quantity that a sweep varies: a list of values, or a range."""
 
     values: tuple[Any, ...] = ()
-    """The values, numbers or words; of a grid [-]."""
+    """The values, numeric or words; of a grid [-]."""
     low: float | None = None
     """Lower end of a range; of a grid or of a sample [-]."""
     high: float | None = None

@@ -24,7 +24,7 @@ def check_command(columns: Mapping[str, Sequence[float]]) -> None:
     """
     for name, values in columns.items():
         if not np.isfinite(values).all():
-            raise ValueError(f"command.{name}: got {list(values)}, wanted finite numbers")
+            raise ValueError(f"command.{name}: got {list(values)}, wanted finite values")
         if name not in FOLLOWED and np.any(values):
             raise ValueError(
                 f"command.{name}: got {list(values)}, but the planar controller follows "

@@ -1,6 +1,6 @@
 """What of an observation can be believed: inside ``jit`` as a flag, at the edge as an error.
 
-``is_valid`` is traced and looks for numbers that no walking robot produces. ``check_observation``
+``is_valid`` is traced and looks for values that no walking robot produces. ``check_observation``
 is for the host and for the first sample, of a robot that stands: a convention that differs from
 ours shows there, in feet that are not under their hips or joints that bend the other way.
 """
@@ -81,7 +81,7 @@ def or_neutral(observation: Observation, valid: Bool[Array, ""]) -> Observation:
 
 
 def is_concrete(tree: Any) -> bool:
-    """Whether all numbers can be looked at: none is traced by ``jit``, ``vmap`` or ``grad``."""
+    """Whether all values are concrete: none is traced by ``jit``, ``vmap`` or ``grad``."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -96,7 +96,7 @@ def check_shapes(observation: Observation) -> None:
             hint = ": legs FR, FL, RR, RL by joints" if value.shape == (12,) else ""
             raise ValueError(f"observation.{name}: got shape {value.shape}, wanted {wanted}{hint}")
         if value.dtype.kind not in "fiub":
-            raise ValueError(f"observation.{name}: got type {value.dtype}, wanted numbers")
+            raise ValueError(f"observation.{name}: got type {value.dtype}, wanted a numeric type")
 
 
 def check_observation(robot: RobotParams, observation: Observation) -> None:
@@ -119,7 +119,7 @@ def check_observation(robot: RobotParams, observation: Observation) -> None:
     values = {name: np.asarray(getattr(observation, name), float) for name in SHAPES}
     for name, value in values.items():
         if not np.isfinite(value).all():
-            raise ValueError(f"observation.{name}: got {value.tolist()}, wanted finite numbers")
+            raise ValueError(f"observation.{name}: got {value.tolist()}, wanted finite values")
     if not np.isin(values["contact"], (0, 1)).all():
         raise ValueError(
             f"observation.contact: got {values['contact'].tolist()}, wanted whether each foot "

@@ -90,16 +90,15 @@ def build_planner(spec: ControllerSpec) -> Planner:
     return plan
 
 
-def _build_stance_planner(spec: ControllerSpec) -> Planner:
-    """The paper's scheme: the present contact mode's lifted model, as if it lasted."""
+def _build_model_at(
+    spec: ControllerSpec,
+) -> Callable[[Tables, Array, Start], tuple[Array, LinearModel | None]]:
+    """Function (tables, problem, start) -> lifted state, and the model if none of the tables is."""
     steps = round(spec.model_dt / spec.model.dt)
     family = build_family(spec.model)
     lift = family.lift
 
-    def model_here(
-        tables: Tables, problem: Array, start: Start
-    ) -> tuple[Array, LinearModel | None]:
-        """Lifted state, and the model where that is not one of the tables."""
+    def model_at(tables: Tables, problem: Array, start: Start) -> tuple[Array, LinearModel | None]:
         if spec.model.tabulated:
             z = lift(None, start)
             if not spec.model.measured_feet:
@@ -112,6 +111,12 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
             start = start._replace(feet=fits.feet[problem])
         return lift(model_params, start), operating_point(family, model_params, start, force, steps)
 
+    return model_at
+
+
+def _build_stance_planner(spec: ControllerSpec) -> Planner:
+    """The paper's scheme: the present contact mode's lifted model, as if it lasted."""
+    model_at = _build_model_at(spec)
     limited = spec.friction_rows or spec.torque_rows
 
     def plan(tables: Tables, task: ForceTask) -> ForcePlan:
@@ -143,7 +148,7 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         last = jnp.where(fresh, 0.0, task.memory.plan[:4])
         start = Start(body.x, feet, last, rate * clock.elapsed, rate)
         problem = params.problem[clock.gait, clock.phase]
-        z, model = model_here(tables, problem, start)
+        z, model = model_at(tables, problem, start)
         solution = solve_lmpc(
             tables.lmpc, problem, z, reference, task.memory, spec, model=model, rows=rows
         )
@@ -284,17 +289,17 @@ def periodic_motion(
     low = jnp.minimum(where.astype(jnp.int32), samples - 2)
     part = (where - low)[..., None]
     level = jnp.minimum(cycle, levels - 1)
-    at, after = (params.reference[gait_index, level, phase, i] for i in (low, low + 1))
-    return (1.0 - part) * at + part * after
+    left, right = (params.reference[gait_index, level, phase, i] for i in (low, low + 1))
+    return (1.0 - part) * left + part * right
 
 
 def _contacts(robot: RobotParams, task: ForceTask) -> Float[Array, "2 2"]:
-    """Mean contact point (x, z) of the stance feet at each end, world frame from the CoM [m].
+    """Mean contact point (x, z) of each pair's stance feet, from the CoM in world axes [m].
 
-    An end without a stance foot gets its swing feet, which no force acts on.
+    A pair without a stance foot gets its swing feet, which no force acts on.
     """
     sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
-    ends = (task.body.feet - sole - task.body.x[:2]).reshape(2, 2, 2)
-    weight = task.stance.reshape(2, 2).astype(ends.dtype)
+    pairs = (task.body.feet - sole - task.body.x[:2]).reshape(2, 2, 2)
+    weight = task.stance.reshape(2, 2).astype(pairs.dtype)
     weight = jnp.where(weight.sum(axis=1, keepdims=True) > 0, weight, 1.0)
-    return (ends * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]
+    return (pairs * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]

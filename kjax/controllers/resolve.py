@@ -320,8 +320,8 @@ def multiphase_params(
     mass, inertia = body_numbers(config, robot)
 
     names = [one.name for one in gaits]
-    ends = [levers(config.gaits[name], robot) for name in names]
-    feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in ends]
+    arms = [levers(config.gaits[name], robot) for name in names]
+    feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in arms]
     return multiphase.MultiPhaseParams(
         nodes=jnp.asarray(cycle_nodes(gaits, config)),
         state_weights=_column(config, names, "Q"),

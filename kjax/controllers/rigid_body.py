@@ -13,7 +13,7 @@ from kjax.types import GRAVITY, RobotParams
 
 
 def own_body(srb: SrbConfig, robot: RobotParams, height: float | None = None) -> SrbConfig:
-    """The rigid body of a config, the robot's own numbers where it gives none.
+    """The rigid body of a config, the robot's own parameters where it gives none.
 
     Args:
       srb: of the config.
@@ -51,7 +51,7 @@ def levers(own: InSi, robot: RobotParams) -> tuple[Any, Any]:
 def mean_force(gaits: list[Gait], config: InSi, robot: RobotParams) -> Float[Array, "G 2"]:
     """Vertical force of one front and one rear leg of each gait, mean of its stance [N].
 
-    Over a cycle the legs carry the weight and leave no net turn:
+    Over a cycle the legs carry the weight and leave no net pitch moment:
     J_f + J_r = m g T,  J_f l_f = J_r l_r,  each shared by the stances of its legs. Zero where the
     config wants the paper's.
     """

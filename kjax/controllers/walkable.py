@@ -87,7 +87,7 @@ def cycle_nodes(gaits: list[gait.Gait], config: RunConfig | Overlay | InSi) -> n
 
 
 def check_walkable(config: RunConfig, robot: RobotParams) -> None:
-    """Refuse a config that this robot cannot walk with; concrete numbers only.
+    """Refuse a config that this robot cannot walk with; concrete values only.
 
     Raises:
       ValueError: for a phase of a gait shorter than a tick, force bounds and torque limits that
@@ -121,8 +121,8 @@ def _check_timing(config: RunConfig, one: gait.Gait) -> None:
                 f"{name}: offset and duty leave a {kind} of {duration:.4g} s, shorter than "
                 f"lmpc.control_dt {tick:g} s"
             )
-    ends = [(any(phase.stance[:2]), any(phase.stance[2:])) for phase in one.phases]
-    once = sorted(end for end in ends if any(end)) == [(False, True), (True, False)]
+    pairs = [(any(phase.stance[:2]), any(phase.stance[2:])) for phase in one.phases]
+    once = sorted(pair for pair in pairs if any(pair)) == [(False, True), (True, False)]
     if own.horizon == "multiphase" and not once:
         raise ValueError(
             f"{name}.horizon = 'multiphase' takes one phase in which front legs stand and one in "

@@ -50,7 +50,7 @@ class LoopState(NamedTuple):
     Attributes:
       controller: state of the controller.
       track: true heading at the start, ``None`` on the planar base.
-      alive: whether it has neither fallen nor left the finite numbers.
+      alive: whether it has neither fallen nor a state that is not finite.
     """
 
     controller: ControllerState
@@ -136,7 +136,7 @@ def build_closed_loop(
     def sense(noise: Noise, sensed: Sensed) -> Observation:
         if not scene.noise:
             return see(sensed)
-        # Else XLA draws the numbers again for each of their uses.
+        # Else XLA draws the noise again for each of its uses.
         seen = add_noise(see(sensed), noise.sensors.astype(sensed.qpos.dtype))
         return jax.lax.optimization_barrier(seen)
 

@@ -116,7 +116,7 @@ def _sliding_speed(
     R_world_body, omega = spatial.rotation_matrix(quat), velocity[3:]
     foot = robot.hip_pos + spatial.foot_position(robot, hip, trig)
     J = spatial.foot_jacobian(robot, hip, trig)
-    centre = jnp.cross(omega, foot) + jnp.einsum("lij,lj->li", J, rates)
+    foot_vel = jnp.cross(omega, foot) + jnp.einsum("lij,lj->li", J, rates)
     # The calf turns with the trunk, about the abduction axis, and twice about the leg's own.
     zero, one = jnp.zeros(4), jnp.ones(4)
     roll_axis = jnp.stack([one, zero, zero], axis=-1)
@@ -124,5 +124,5 @@ def _sliding_speed(
     bend = rates[:, 1] + rates[:, 2]
     omega_calf = omega + rates[:, :1] * roll_axis + bend[:, None] * pitch_axis
     bottom = -robot.foot_radius * R_world_body[2]  # straight down in the world
-    world = velocity[:3] + (centre + jnp.cross(omega_calf, bottom)) @ R_world_body.T
+    world = velocity[:3] + (foot_vel + jnp.cross(omega_calf, bottom)) @ R_world_body.T
     return jnp.hypot(world[:, 0], world[:, 1])

@@ -34,7 +34,7 @@ def _draw(seed: Any, step: Any, stream: int, count: int) -> Any:
 
 
 def sensor_row(seed: Int[Array, ""], step: Int[Array, ""], base: str) -> Float[Array, "n"]:
-    """Standard normal numbers of an episode's physics step, n of ``noise_dim``, float32."""
+    """Standard normal values of an episode's physics step, n of ``noise_dim``, float32."""
     planar = _draw(seed, step, _PLANAR, NOISE_DIM)
     if base == "planar":
         return planar
@@ -55,8 +55,8 @@ def sensor_noise(params: EpisodeParams, base: str, steps: int, start: int = 0) -
     scale = np.asarray(params.noise_scale)
     if not scale.any():
         return np.zeros((steps, len(scale)), np.float32)
-    numbers = np.arange(start, start + steps, dtype=np.int32)
-    return np.asarray(_sensor_rows(params.seed, numbers, base)) * scale
+    indices = np.arange(start, start + steps, dtype=np.int32)
+    return np.asarray(_sensor_rows(params.seed, indices, base)) * scale
 
 
 def force_noise(params: EpisodeParams, per_tick: int, ticks: int) -> Float[np.ndarray, "ticks 4"]:

@@ -64,7 +64,7 @@ class Recording:
         """The episode of one robot."""
         samples, ticks = int(self.samples[robot]), int(self.ticks[robot])
 
-        def own(series: np.ndarray) -> np.ndarray:
+        def of_robot(series: np.ndarray) -> np.ndarray:
             return np.asarray(series[:samples, robot])
 
         log = TickLog(*(np.asarray(series[:ticks, robot]) for series in self.log))
@@ -72,12 +72,12 @@ class Recording:
         return Trajectory(
             dt=self.dt,
             time=np.arange(samples) * self.dt,
-            qpos=own(self.qpos),
-            qvel=own(self.qvel),
-            x=own(self.x),
-            feet=own(self.feet),
-            foot_force=own(self.foot_force),
-            torque=own(self.torque).reshape(-1, 4, 3),
+            qpos=of_robot(self.qpos),
+            qvel=of_robot(self.qvel),
+            x=of_robot(self.x),
+            feet=of_robot(self.feet),
+            foot_force=of_robot(self.foot_force),
+            torque=of_robot(self.torque).reshape(-1, 4, 3),
             gait=log.gait[held],
             stance=log.stance[held],
             force=log.force[held],
@@ -88,7 +88,7 @@ class Recording:
             plan_residual=log.residual,
             plan_iterations=log.iterations,
             plan_time=np.asarray(self.plan_time[:ticks, robot]),
-            act_time=own(self.act_time),
+            act_time=of_robot(self.act_time),
             wall_time=self.wall_time,
             fell=bool(self.fell[robot]),
             interrupted=self.interrupted,

@@ -28,7 +28,7 @@ class Field:
       seed: of where the obstacles lie.
       count: number of obstacles, steps or patches.
       start: where the field begins [m].
-      end: where it ends [m].
+      end: its far end [m].
       height_min: lowest obstacle, or rise of a step [m].
       height_max: highest obstacle, or rise of a step [m].
       slope: inclination of a slope; below 0 it leads down first [deg].
@@ -85,7 +85,7 @@ def shapes(kind: str, count: int) -> list[mujoco.mjtGeom]:
 def generate(field: Field) -> Terrain:
     """The obstacles of a field, from where the robot starts.
 
-    Kinds: ``paper`` (blocks, cubes and capsules in turn, on the left track, the right one or
+    Kinds: ``paper`` (blocks, cubes and capsules alternating, on the left track, the right one or
     both), ``blocks`` (random blocks on both tracks), ``steps`` (a flight of steps up, then down),
     ``slope`` (up, level, down; or down, level, up), ``patches`` (level, slippery plates).
     """
@@ -172,13 +172,13 @@ def _paper(field: Field, rng: np.random.Generator) -> _Boxes:
     for i, x in enumerate(_spread(field, rng)):
         h = rng.uniform(field.height_min, field.height_max)
         side = rng.integers(-1, 2)  # right track, both, left track
-        turn = rng.uniform(-1.0, 1.0)
+        yaw = rng.uniform(-1.0, 1.0)
         y, q = float(side * field.track), _ACROSS
         if i % 3 == 0:  # block
             half = [rng.uniform(0.06, 0.12), 0.12 if side else _WIDE, h / 2]
-            q = _yaw(0.4 * turn if side else 0.0)
+            q = _yaw(0.4 * yaw if side else 0.0)
         elif i % 3 == 1:  # cube, always under one track
-            half, y, q = [h / 2] * 3, float((side or 1) * field.track), _yaw(0.7 * turn)
+            half, y, q = [h / 2] * 3, float((side or 1) * field.track), _yaw(0.7 * yaw)
         else:  # capsule, lying across
             half = [h / 2, 0.15 if side else _WIDE, 0.0]
         pos.append([x, y, h / 2])
@@ -193,9 +193,9 @@ def _blocks(field: Field, rng: np.random.Generator) -> _Boxes:
     side = rng.integers(-1, 2, field.count)
     length = rng.uniform(0.05, 0.15, field.count)
     size = np.stack([length, np.where(side == 0, _WIDE, 0.12), h / 2], axis=-1)
-    turn = np.where(side == 0, 0.0, rng.uniform(-0.4, 0.4, field.count))
+    yaw = np.where(side == 0, 0.0, rng.uniform(-0.4, 0.4, field.count))
     pos = np.stack([x, side * field.track, h / 2], axis=-1)
-    return pos, np.array([_yaw(a) for a in turn]), size
+    return pos, np.array([_yaw(a) for a in yaw]), size
 
 
 def _steps(field: Field, rng: np.random.Generator) -> _Boxes:

@@ -21,8 +21,10 @@ from kjax import cli
 from kjax.config import ConfigError, RunConfig
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
-from kjax.sim.episode import SETTLE_TIME, Trajectory, metrics
+from kjax.sim.metrics import SETTLE_TIME, metrics
+from kjax.sim.resolve import batch_spec, resolve_episode, resolve_goal
 from kjax.sim.summary import summarise
+from kjax.sim.trajectory import Trajectory
 
 # What the table shows: metric, printed name, format.
 TABLE = (
@@ -77,13 +79,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     cache = None if args.seeds is None else open_cache(folder, fresh=args.restart)
     clock = time.perf_counter()
     try:
-        simulation = MujocoEngine(config)
+        simulation = MujocoEngine(batch_spec(config))
+        simulation.program(resolve_episode(config))
     except ConfigError as error:
         cli.fail(str(error))
     print(f"models fitted, controller compiled: {time.perf_counter() - clock:.1f} s", flush=True)
     if cache is None:
         run = _simulate_with_bar(simulation, config, view=args.view)
-        result = metrics(run, config)
+        result = metrics(run, resolve_goal(config))
         if run.interrupted:
             print(f"interrupted {_progress(run, config)}: no metrics")
             result = {key: result[key] for key in INTERRUPTED}
@@ -132,9 +135,7 @@ def _simulate_with_bar(
                 bar.update(done * config.sim.sim_dt - bar.n)
 
         if not view:
-            return simulate(
-                simulation, seed=config.seed, terrain_seed=config.terrain.seed, on_tick=on_tick
-            )
+            return simulate(simulation, resolve_episode(config), on_tick=on_tick)
         return _simulate_in_viewer(simulation, config, on_tick)
 
 
@@ -178,9 +179,7 @@ def _simulate_in_viewer(simulation: MujocoEngine, config: RunConfig, on_tick: On
             time.sleep(ahead)
 
     try:
-        return simulate(
-            simulation, seed=config.seed, terrain_seed=config.terrain.seed, on_tick=show
-        )
+        return simulate(simulation, resolve_episode(config), on_tick=show)
     finally:
         if viewer is not None:
             viewer.close()
@@ -211,7 +210,7 @@ def run_seeds(
                 return run, this
             if first is None:
                 first, first_config = run, this
-            cache.add({keys[seed]: metrics(run, this)})
+            cache.add({keys[seed]: metrics(run, resolve_goal(this))})
         done = {str(s): cache[key] for s, key in keys.items() if key in cache}
         cli.save_json(
             folder / "seeds.json",

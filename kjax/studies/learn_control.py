@@ -30,6 +30,7 @@ from kjax.prediction import families, learned, storage
 from kjax.robots import get_robot
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.resolve import batch_spec, resolve_episode
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.types import MODE_ALPHA, Mode
@@ -188,8 +189,8 @@ def prediction_errors(model: Any, data: Any) -> jax.Array:
 def walk(args: argparse.Namespace, path: Path | None) -> dict[str, Any]:
     """The config's command in MuJoCo."""
     config = run_config(path)
-    engine = BatchEngine(config)
-    recording = engine.run([dataclasses.replace(config, seed=s) for s in range(args.walks)])
+    engine = BatchEngine(batch_spec(config))
+    recording = engine.run([resolve_episode(config, seed=seed) for seed in range(args.walks)])
     if recording.interrupted:
         raise KeyboardInterrupt
     rows = summarise(recording.metrics())

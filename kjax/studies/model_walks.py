@@ -180,8 +180,9 @@ def config_of(gait: str, keys: dict[str, Any]) -> RunConfig:
 def run(configs: list[RunConfig]) -> list[dict[str, Any]]:
     """Metrics of the episodes."""
     from kjax.sim.engines.mujoco_batch import BatchEngine
+    from kjax.sim.resolve import batch_spec, resolve_episodes
 
-    recording = BatchEngine(configs[0], torques="held").run(configs)
+    recording = BatchEngine(batch_spec(configs[0]), torques="held").run(resolve_episodes(configs))
     if recording.interrupted:
         raise KeyboardInterrupt
     return list(recording.metrics())

@@ -31,10 +31,10 @@ from kjax.robots import get_robot
 from kjax.runs.batches import batch_key, run_batch
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.contacts import body_contact
-from kjax.sim.episode import Trajectory
 from kjax.sim.intervals import median_interval, wilson
 from kjax.sim.observe import find_addresses
-from kjax.sim.scene import build_model
+from kjax.sim.resolve import build_scene
+from kjax.sim.trajectory import Trajectory
 
 GAITS = {"trot": "trot_velocity.toml", "trot_long": "trot_velocity_long.toml"}
 TITLES = {"trot": "trot, 6 x 1 ms", "trot_long": "trot, 10 x 20 ms"}
@@ -179,10 +179,9 @@ def after_step(run: Trajectory, config: RunConfig) -> dict[str, Any]:
 @lru_cache
 def _scene(name: str, base: str, contacts: str) -> tuple[Any, Any]:
     """The scene of all episodes, for collisions only, and the robot's addresses in it."""
-    sim = load_config(RunConfig, None, {"sim.base": base, "sim.contacts": contacts}).sim
-    robot = get_robot(name)
-    model = build_model(robot, sim, visual=False)
-    return model, find_addresses(robot, model)
+    keys = {"robot": name, "sim.base": base, "sim.contacts": contacts}
+    model = build_scene(load_config(RunConfig, None, keys), visual=False)
+    return model, find_addresses(get_robot(name), model)
 
 
 def measured(case: Case, args: Namespace, cache: Cache) -> list[dict[str, Any]]:

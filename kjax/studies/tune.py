@@ -28,6 +28,7 @@ from kjax.config import CommandConfig, RunConfig
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.resolve import batch_spec, resolve_episodes
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.tuning.optimise import build_objective, descend
@@ -257,16 +258,16 @@ def evolve(
             costs.append(row)
             spent.append(float(seconds_of_it))
     walks = mujoco_scenarios(config, args)
-    engine = BatchEngine(walks[0], torques="held")
+    engine = BatchEngine(batch_spec(walks[0]), torques="held")
     with tqdm(total=round(seconds), unit="s", desc="CMA-ES", disable=None) as bar:
         while sum(spent) < seconds and not search.stop():
             clock = time.perf_counter()
             asked = search.ask()
             candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
-            recording = engine.run([
+            recording = engine.run(resolve_episodes([
                 dataclasses.replace(c, command=w.command, seed=w.seed, sim=w.sim)
                 for c in candidates for w in walks
-            ])  # fmt: skip
+            ]))  # fmt: skip
             if recording.interrupted:
                 raise KeyboardInterrupt
             row = recording_costs(recording).reshape(len(asked), len(walks)).mean(axis=1)
@@ -308,7 +309,7 @@ def walk(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, 
     """The config's whole command in MuJoCo with some values, torques at every step."""
     chosen = tuned_config(config, overrides)
     configs = [dataclasses.replace(chosen, seed=seed) for seed in range(seeds)]
-    recording = BatchEngine(chosen).run(configs)
+    recording = BatchEngine(batch_spec(chosen)).run(resolve_episodes(configs))
     if recording.interrupted:
         raise KeyboardInterrupt
     rows = summarise(recording.metrics())

@@ -109,8 +109,8 @@ def zoom_window(end: float, config: RunConfig) -> tuple[float, float]:
         for t, a, b in zip(times[1:], velocities, velocities[1:], strict=False)
         if t < end
     ]
-    centre = max(steps)[1] + 0.5 if steps else end - 1.0
-    start = max(0.0, min(centre - 1.0, end - 2.0))
+    middle = max(steps)[1] + 0.5 if steps else end - 1.0
+    start = max(0.0, min(middle - 1.0, end - 2.0))
     return start, min(end, start + 2.0)
 
 

@@ -62,7 +62,7 @@ def sweep_figure(dataset: xr.Dataset, sweep: SweepConfig, path: Path) -> None:
 
 
 def sweep_summary(dataset: xr.Dataset, sweep: SweepConfig) -> dict[str, Any]:
-    """What the figure shows as numbers: values and ends of their intervals over the axes."""
+    """What the figure shows, as values with their intervals over the axes."""
     keep = [str(dim) for dim in dataset["fell"].dims if dim != "seed"]
     metrics = sweep.figure.metrics if sweep.figure else ("success",)
     out: dict[str, Any] = {

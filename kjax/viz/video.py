@@ -113,9 +113,9 @@ def _build_sticks(config: RunConfig) -> Callable[[np.ndarray], tuple[np.ndarray,
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         legs = np.concatenate([data.xpos[bodies], data.geom_xpos[at.feet][:, None]], axis=1)
-        ends = legs[:, 0].reshape(2, 2, 3).mean(axis=1)  # between the hips, front and rear
-        overhang = 0.12 * (ends[0] - ends[1])
-        trunk = np.stack([ends[0] + overhang, ends[1] - overhang])
+        hips = legs[:, 0].reshape(2, 2, 3).mean(axis=1)  # between the hips, front and rear
+        overhang = 0.12 * (hips[0] - hips[1])
+        trunk = np.stack([hips[0] + overhang, hips[1] - overhang])
         return trunk[:, ::2], legs[..., ::2]
 
     return sticks

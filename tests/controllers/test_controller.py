@@ -528,8 +528,8 @@ def knee_backward(foot):
     l1, l2 = go1.THIGH_LENGTH, go1.CALF_LENGTH
     reach = foot @ foot
     knee = -np.arccos((reach - l1**2 - l2**2) / (2 * l1 * l2))
-    lean = np.arctan2(-foot[0], -foot[1])
-    return np.array([lean - np.arctan2(l2 * np.sin(knee), l1 + l2 * np.cos(knee)), knee])
+    angle = np.arctan2(-foot[0], -foot[1])
+    return np.array([angle - np.arctan2(l2 * np.sin(knee), l1 + l2 * np.cos(knee)), knee])
 
 
 def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller, tables, plan):
@@ -628,13 +628,13 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
     view = build_base(config.sim.base).view(tables.params.robot, None, observation)
     feet = np.array(view.planar.feet - view.planar.x[:2]).reshape(2, 2, 2)
     feet[..., 1] -= go1.FOOT_RADIUS
-    ends = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
+    contacts = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
     family = build.build_family(build.model_spec(config.koopman))
     model_params, force, _ = jax.tree.map(lambda a: a[0], tables.params.fits.prediction)
 
     def forces(u_before, elapsed):
         start = families.Start(
-            view.planar.x.at[0].set(0.0), jnp.asarray(ends) @ view.planar.rotation, u_before,
+            view.planar.x.at[0].set(0.0), jnp.asarray(contacts) @ view.planar.rotation, u_before,
             jnp.pi * elapsed / stance_time, jnp.pi / stance_time,
         )  # fmt: skip
         model = families.operating_point(family, model_params, start, force, 4)

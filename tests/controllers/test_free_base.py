@@ -60,14 +60,14 @@ def disturbed(seed, *, planar=False, scale=1.0, dtype=float):
 def seen_from(observation, yaw, shift):
     """The same robot somewhere else, looking elsewhere."""
     c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     quat = np.zeros(4)
     half = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     mujoco.mju_mulQuat(quat, half, np.asarray(observation.base_quat, float))
     return observation._replace(
-        base_pos=jnp.asarray(turn @ observation.base_pos + np.array([*shift, 0.0])),
+        base_pos=jnp.asarray(rotation @ observation.base_pos + np.array([*shift, 0.0])),
         base_quat=jnp.asarray(quat),
-        base_vel=jnp.asarray(turn @ observation.base_vel),
+        base_vel=jnp.asarray(rotation @ observation.base_vel),
     )
 
 
@@ -112,7 +112,7 @@ def test_a_turn_after_the_start_is_turned_back(free, tables):
 
 
 def yaw_moment(observation, torque, stance):
-    """Moment of the stance feet about the vertical through the trunk."""
+    """Yaw moment of the stance feet about the vertical through the trunk."""
     forces, arms = pressed(observation, torque, stance)
     return np.sum(arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0])
 

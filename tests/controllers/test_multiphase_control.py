@@ -90,14 +90,14 @@ def test_each_phase_is_planned_by_its_own_scheme_and_solved(ticks):
 
 
 def test_the_force_on_a_pitched_trunk_keeps_to_the_pyramid_of_the_world(controller, tables, plan):
-    turn = 0.2  # nose up: a turn about +y by -0.2
-    half = [np.cos(turn / 2), 0.0, -np.sin(turn / 2), 0.0]
+    pitch = 0.2  # nose up: about +y by -0.2
+    half = [np.cos(pitch / 2), 0.0, -np.sin(pitch / 2), 0.0]
     seen = standing(base_quat=half)
     state, info = plan(tables, controller.init(tables, seen), seen)
     assert int(info.mode) == Mode.FRONT
     force = np.asarray(state.force)[Leg.FR]
     assert 10.0 - 1e-3 <= force[2] <= 340.0 + 1e-3
-    assert abs(force[0]) == pytest.approx(0.6 * force[2], rel=1e-4)  # the turn asks for all of it
+    assert abs(force[0]) == pytest.approx(0.6 * force[2], rel=1e-4)  # the pitch asks for all of it
 
 
 def test_a_nan_in_the_observation_is_reported_and_leaves_the_reference_force(

@@ -66,7 +66,10 @@ FAULTS = {
         {"contact": np.array([30.0, 30.0, 31.0, 29.0])},
         r"contact: got .* compare forces with a threshold",
     ),
-    "text": ({"base_vel": np.array(["a", "b", "c"])}, r"base_vel: got type <U1, wanted numbers"),
+    "text": (
+        {"base_vel": np.array(["a", "b", "c"])},
+        r"base_vel: got type <U1, wanted a numeric type",
+    ),
     "not a number": ({"base_vel": np.array([0.0, np.nan, 0.0])}, r"base_vel: .* wanted finite"),
     "speed in mm/s": (
         {"base_vel": np.array([300.0, 0.0, 0.0])},

@@ -1,4 +1,4 @@
-"""From numbers to tables: one way inside and outside ``jit``, with derivatives by weights."""
+"""From parameters to tables: one way inside and outside ``jit``, with derivatives by weights."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from kjax.robots import go1
 
 @pytest.fixture(scope="module")
 def both():
-    """Spec and numbers of a trot on the planar base."""
+    """Spec and parameters of a trot on the planar base."""
     return resolve(load_config(RunConfig, None, {"sim.base": "planar"}), go1.PARAMS)
 
 

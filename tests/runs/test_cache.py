@@ -164,10 +164,10 @@ def test_a_full_disk_keeps_what_was_finished(tmp_path, monkeypatch):
     assert len(list(cache.folder.iterdir())) == 1
 
 
-def _add(folder, numbers, ready):
+def _add(folder, values, ready):
     ready.wait()
     cache = Cache(folder)
-    for number in numbers:
+    for number in values:
         cache.add({cache.key(number): number})
 
 

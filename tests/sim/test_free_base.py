@@ -127,12 +127,12 @@ def test_noise_of_the_trunk_is_three_dimensional(model):
     np.testing.assert_allclose(noisy.base_vel - clean.base_vel, [4e-3, 34e-3, 5e-3], atol=1e-12)
     rates = noisy.base_ang_vel - clean.base_ang_vel
     np.testing.assert_allclose(rates, [35e-3, -6e-3, 36e-3], atol=1e-12)
-    turn, back = np.zeros(3), np.zeros(4)
+    angle, back = np.zeros(3), np.zeros(4)
     mujoco.mju_negQuat(back, np.asarray(clean.base_quat))
     mujoco.mju_mulQuat(back, back, np.asarray(noisy.base_quat))
-    mujoco.mju_quat2Vel(turn, back, 1.0)
+    mujoco.mju_quat2Vel(angle, back, 1.0)
     # A first-order turn by 46 mrad is right to its cube over 12.
-    np.testing.assert_allclose(turn, [32e-3, -3e-3, 33e-3], atol=1e-5)
+    np.testing.assert_allclose(angle, [32e-3, -3e-3, 33e-3], atol=1e-5)
     assert np.linalg.norm(noisy.base_quat) == pytest.approx(1.0, abs=1e-12)
 
 

@@ -38,8 +38,8 @@ def test_a_few_values_have_no_interval():
 def test_a_median_s_interval_holds_the_median_as_often_as_it_says():
     rng = np.random.default_rng(0)
     draws = rng.exponential(size=(4000, 64))
-    ends = np.array([median_interval(row) for row in draws])
-    holds = ((ends[:, 0] <= np.log(2.0)) & (ends[:, 1] >= np.log(2.0))).mean()
+    bounds = np.array([median_interval(row) for row in draws])
+    holds = ((bounds[:, 0] <= np.log(2.0)) & (bounds[:, 1] >= np.log(2.0))).mean()
     assert 0.94 < holds < 0.985  # 95 % at least, in steps of single ranks; 4000 draws
 
 

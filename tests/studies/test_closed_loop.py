@@ -13,15 +13,16 @@ def engine(monkeypatch, standing_run):
     """Stand in for the engine: runs stand still for ``seconds``, interrupted if ``interrupted``."""
     engine = SimpleNamespace(seconds=2.0, interrupted=False, compiled=0, episodes=0)
 
-    def build(config):
+    def build(spec):
         engine.compiled += 1
-        return config
+        return SimpleNamespace(program=lambda config: None)
 
-    def simulate(config, *_, **more):
+    def simulate(_, config, **more):
         engine.episodes += 1
         return standing_run(config, engine.seconds, interrupted=engine.interrupted)
 
     monkeypatch.setattr(closed_loop, "MujocoEngine", build)
+    monkeypatch.setattr(closed_loop, "resolve_episode", lambda config: config)
     monkeypatch.setattr(closed_loop, "simulate", simulate)
     monkeypatch.setattr(
         "kjax.viz.plots.closed_loop_figure",

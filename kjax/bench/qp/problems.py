@@ -13,22 +13,25 @@ from kjax.config import RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.controllers import planning
 from kjax.controllers.controller import build_controller
-from kjax.controllers.resolve import controller_spec
+from kjax.controllers.params import condense
+from kjax.controllers.resolve import controller_spec, resolve
 from kjax.mpc import lmpc, multiphase
 from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
+from kjax.sim.resolve import resolve_episode
 
 
 def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
     """What ``planner`` returns as memory along a walk of the config's own controller."""
-    simulation = MujocoEngine(config)
+    episode = resolve_episode(config)
+    simulation = MujocoEngine(episode.spec)
     controller, model = build_controller(controller_spec(config)), simulation.model
-    tables = simulation.program(config).tables
+    tables = simulation.program(episode).tables
     recorder = build_controller(controller_spec(config), planner)
     plan, act = jax.jit(controller.plan), jax.jit(controller.act)
     look = jax.jit(lambda state, seen: recorder.plan(tables, state, seen)[0].memory)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = initial_state(config, model)
+    data.qpos[:], data.qvel[:] = initial_state(episode.start, model, simulation.addresses)
     mujoco.mj_forward(model, data)
     state, kept = None, []
     steps = round(seconds / config.sim.sim_dt)
@@ -64,7 +67,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
         return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
 
     mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
-    hessian = MujocoEngine(config).program(config).tables.lmpc.hessian
+    hessian = condense(*resolve(config)).lmpc.hessian
     H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
     used = (upper > lower).any(axis=1)  # nothing is planned in flight
     return {

@@ -25,9 +25,10 @@ from kjax.robots import get_robot
 from kjax.sim.engines.mjx import MjxEngine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine, scene_models
-from kjax.sim.episode import initial_state
+from kjax.sim.episode import Episode, initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses
+from kjax.sim.resolve import batch_spec, resolve_episode, resolve_episodes
 
 BATCHES = (16, 128, 1024)
 MJX_BATCHES = (16, 128, 1024)
@@ -103,16 +104,16 @@ def cases(gait: str, count: int, seconds: float) -> list[RunConfig]:
 def c_batch(gait: str, torques: Any, size: int, rounds: int) -> dict[str, float]:
     """Closed loop, and the bare engine on the torques of that loop, in turn."""
     seconds = WALK if size >= 1024 else 2.0 * WALK
-    configs = cases(gait, size, seconds)
-    engine = BatchEngine(configs[0], torques=torques)
-    recording = engine.run(configs)  # compiles
-    bare = bare_batch(engine, configs, recording.torque, torques)
-    steps = size * round(seconds / configs[0].sim.sim_dt)
-    per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
+    episodes = resolve_episodes(cases(gait, size, seconds))
+    spec = episodes[0].spec
+    engine = BatchEngine(spec, torques=torques)
+    recording = engine.run(episodes)  # compiles
+    bare = bare_batch(engine, episodes, recording.torque, torques)
+    steps, per_tick = size * round(seconds / spec.scene.sim_dt), spec.per_tick
     walked = int(recording.ticks.sum()) * per_tick  # fewer steps where a robot fell
     closed_times, bare_times = [], []
     for _ in range(rounds):
-        closed_times.append(engine.run(configs).wall_time)
+        closed_times.append(engine.run(episodes).wall_time)
         bare_times.append(bare())
     ratios = np.array(bare_times) / np.array(closed_times) * walked / steps
     return {
@@ -127,15 +128,17 @@ def c_batch(gait: str, torques: Any, size: int, rounds: int) -> dict[str, float]
 
 
 def bare_batch(
-    engine: BatchEngine, configs: Sequence[RunConfig], torque: np.ndarray, torques: str
+    engine: BatchEngine, episodes: Sequence[Episode], torque: np.ndarray, torques: str
 ) -> Callable[[], float]:
     """MuJoCo's own batch with as many threads, fed recorded torques: time of a run [s]."""
-    model = scene_models(engine.model, configs[:1])[0]
-    per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
-    batch = mujoco.batch.Batch(model, nsim=len(configs), nthread=engine.threads)
+    robot = get_robot(engine.spec.scene.robot)
+    model = scene_models(robot, engine.model, episodes[:1])[0]
+    per_tick = engine.spec.per_tick
+    batch = mujoco.batch.Batch(model, nsim=len(episodes), nthread=engine.threads)
     qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    order = np.argsort(find_addresses(get_robot(), model).actuator.reshape(-1))
-    starts = [initial_state(config, model) for config in configs]
+    at = find_addresses(robot, model)
+    order = np.argsort(at.actuator.reshape(-1))
+    starts = [initial_state(one.start, model, at) for one in episodes]
 
     def once() -> float:
         batch.reset()
@@ -158,9 +161,11 @@ def bare_batch(
 def python_loop(seconds: float) -> dict[str, float]:
     """The obvious alternative: one robot after the other, torques at every step."""
     config = cases("trot", 1, seconds)[0]
-    simulation = MujocoEngine(config)
-    simulate(simulation)
-    times = [simulate(simulation, seed=seed).wall_time for seed in range(3)]
+    simulation = MujocoEngine(batch_spec(config))
+    simulate(simulation, resolve_episode(config))
+    times = [
+        simulate(simulation, resolve_episode(config, seed=seed)).wall_time for seed in range(3)
+    ]
     return {
         "robot_steps_per_s": round(seconds / config.sim.sim_dt) / float(np.median(times)),
     }
@@ -168,15 +173,17 @@ def python_loop(seconds: float) -> dict[str, float]:
 
 def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     """Closed loop on MJX, and ``mjx.step`` in a scan with torques held, in turn."""
-    configs = cases("trot", size, WALK_MJX)
-    engine = MjxEngine(configs[0])
+    episodes = resolve_episodes(cases("trot", size, WALK_MJX))
+    spec = episodes[0].spec
+    engine = MjxEngine(spec)
     clock = time.perf_counter()
-    recording = engine.run(configs)
+    recording = engine.run(episodes)
     first = time.perf_counter() - clock
-    model = mjx.put_model(engine.model)
-    steps = round(WALK_MJX / configs[0].sim.sim_dt)
-    per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
-    order = np.argsort(find_addresses(get_robot(), engine.model).actuator.reshape(-1))
+    robot = get_robot(spec.scene.robot)
+    model = mjx.put_model(scene_models(robot, engine.model, episodes[:1])[0])
+    steps, per_tick = round(WALK_MJX / spec.scene.sim_dt), spec.per_tick
+    at = find_addresses(robot, engine.model)
+    order = np.argsort(at.actuator.reshape(-1))
 
     def begin(qpos: Any, qvel: Any) -> Any:
         data = mjx.make_data(model)
@@ -193,7 +200,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
 
         return jax.lax.scan(tick, data, torque)
 
-    starts = [initial_state(config, engine.model) for config in configs]
+    starts = [initial_state(one.start, engine.model, at) for one in episodes]
     qpos, qvel = (np.stack(a) for a in zip(*starts, strict=True))
     data = jax.jit(jax.vmap(begin))(qpos, qvel)
     bare = jax.jit(jax.vmap(walk, (0, 1)))
@@ -201,7 +208,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     jax.block_until_ready(bare(data, torque))
     closed_times, bare_times = [], []
     for _ in range(rounds):
-        closed_times.append(engine.run(configs).wall_time)
+        closed_times.append(engine.run(episodes).wall_time)
         clock = time.perf_counter()
         jax.block_until_ready(bare(data, torque))
         bare_times.append(time.perf_counter() - clock)
@@ -255,10 +262,10 @@ def engines_agree() -> dict[str, Any]:
     ]
     rmse, fell = {}, {}
     for name, engine in (
-        ("c", BatchEngine(config, torques="every_step")),
-        ("mjx", MjxEngine(config, torques="every_step")),
+        ("c", BatchEngine(batch_spec(config), torques="every_step")),
+        ("mjx", MjxEngine(batch_spec(config), torques="every_step")),
     ):
-        recording = engine.run(configs)
+        recording = engine.run(resolve_episodes(configs))
         fell[name] = recording.fell
         rmse[name] = np.array([row["velocity_rmse_mps"] for row in recording.metrics()], float)
     both = ~fell["c"] & ~fell["mjx"]
@@ -283,8 +290,9 @@ def mjx_compile_times() -> dict[str, float]:
         "import jax; jax.config.update('jax_enable_x64', False)\n"
         "import kjax.bench.simulation.benchmark as b\n"
         "from kjax.sim.engines.mjx import MjxEngine\n"
-        "configs = b.cases('trot', 16, 0.05); engine = MjxEngine(configs[0])\n"
-        "clock = time.perf_counter(); r = engine.run(configs)\n"
+        "from kjax.sim.resolve import resolve_episodes\n"
+        "walks = resolve_episodes(b.cases('trot', 16, 0.05)); engine = MjxEngine(walks[0].spec)\n"
+        "clock = time.perf_counter(); r = engine.run(walks)\n"
         "print(time.perf_counter() - clock)\n"
     )
     times = []

@@ -156,12 +156,12 @@ _OPERATORS: dict[type, Any] = {
 
 
 def evaluate(text: str, names: Mapping[str, Any], key: str) -> Any:
-    """Value of an expression of names, numbers, + - * / and brackets; a name alone may be text.
+    """Value of an expression of names, literals, + - * / and brackets; a name alone may be text.
 
     Raises:
       ConfigError: naming the key, for anything else, and where the value is no finite number.
     """
-    unwanted = ConfigError(f"{key}: got '= {text}', wanted numbers, axes and + - * / ( )")
+    unwanted = ConfigError(f"{key}: got '= {text}', wanted literals, axes and + - * / ( )")
 
     def value(node: ast.AST) -> Any:
         match node:

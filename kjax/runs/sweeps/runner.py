@@ -25,7 +25,7 @@ class Chunk:
     """Cases that walk together; all chunks of a sweep have one number of robots.
 
     Attributes:
-      cases: their numbers in the plan.
+      cases: their indices in the plan.
       configs: of the robots; the last one is repeated to fill the chunk.
     """
 
@@ -39,10 +39,10 @@ def chunks_of(cases: Sequence[RunConfig], size: int) -> list[Chunk]:
     for number, config in enumerate(cases):
         groups.setdefault((batch_spec(config), config.duration), []).append(number)
     out = []
-    for numbers in groups.values():
-        own = min(size, len(numbers))
-        for first in range(0, len(numbers), own):
-            some = numbers[first : first + own]
+    for indices in groups.values():
+        own = min(size, len(indices))
+        for first in range(0, len(indices), own):
+            some = indices[first : first + own]
             filled = [*some, *[some[-1]] * (own - len(some))]
             out.append(Chunk(cases=np.array(some), configs=[cases[i] for i in filled]))
     return out
@@ -67,7 +67,7 @@ def run_sweep(
       folder: of its results.
       threads: of the C engine; as many as cores if ``None``.
       process: number of this process.
-      processes: number of processes that share the sweep; each runs every so-manieth chunk.
+      processes: number of processes that share the sweep; each runs every ``processes``-th chunk.
       barrier: waits until all processes have come to the same name.
       fresh: drop what the folder holds.
 

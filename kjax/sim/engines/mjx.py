@@ -132,7 +132,7 @@ class MjxEngine:
         sensed, warm = self._start(episodes, models)
         delays = 1 + int(params.delay.max()) // self._unit
         ticks = episodes[0].ticks
-        begin_call, walk_call = self._compiled(axes, own_axes, delays)
+        begin_call, run_call = self._compiled(axes, own_axes, delays)
         place = _sharding(len(episodes))
         if place:
             params, sensed, warm = jax.device_put((params, sensed, warm), place)
@@ -143,7 +143,7 @@ class MjxEngine:
             for done in range(0, ticks, _PIECE):
                 count = min(_PIECE, ticks - done)
                 # The last piece may be shorter than it is computed: one program for all.
-                state, piece = walk_call(tables, own, params, state)
+                state, piece = run_call(tables, own, params, state)
                 pieces.append(jax.device_get(jax.tree.map(lambda a, n=count: a[:n], piece)))
                 if on_progress is not None:
                     on_progress((done + count) * len(episodes), ticks * len(episodes))
@@ -228,7 +228,7 @@ class MjxEngine:
 
             def piece(tables: Any, own: Any, params: EpisodeParams, state: MjxState) -> Any:
                 self.traces += 1
-                return self._walk_piece(tables, own, params, state)
+                return self._run_piece(tables, own, params, state)
 
             self._calls[key] = (
                 jax.jit(jax.vmap(begin, (axes, 0, 0, 0))),
@@ -256,7 +256,7 @@ class MjxEngine:
             step=jnp.zeros((), jnp.int32),
         )
 
-    def _walk_piece(
+    def _run_piece(
         self, tables: Tables, own: dict[str, Array], params: EpisodeParams, state: MjxState
     ) -> tuple[MjxState, MjxTick]:
         model, loop, unit = self._mjx.replace(**own), self._loop, self._unit
@@ -266,7 +266,7 @@ class MjxEngine:
             push = push_at(params, step, xp=jnp).astype(self.dtype)
             pushes = jnp.zeros_like(data.xfrc_applied).at[trunk, :3].set(push)
             stepped = mjx.step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
-            # A robot that has fallen stays as it is, whatever its numbers have become.
+            # A robot that has fallen stays as it is, whatever its state has become.
             return jax.tree.map(
                 lambda new, old: jnp.where(alive, new, old), _same_types(stepped, data), data
             )

@@ -20,7 +20,7 @@ class Row:
     """One line of the table.
 
     Attributes:
-      metric: key of ``kjax.sim.episode.metrics``, or ``falls`` (number) or ``crossed`` (share).
+      metric: key of ``kjax.sim.metrics.metrics``, or ``falls`` (number) or ``crossed`` (share).
       label: what is shown, with its unit.
       paper: what the paper says of it.
       target: bound to meet: an upper one, for ``crossed`` a lower one.

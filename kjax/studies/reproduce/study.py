@@ -18,6 +18,7 @@ import numpy as np
 from kjax import cli
 from kjax.config import ConfigError, FitStudyConfig, load_config
 from kjax.config.shipped import shipped_config
+from kjax.controllers.resolve import build_command
 from kjax.runs.batches import batch_key, run_batch
 from kjax.runs.cache import Cache, open_cache
 from kjax.runs.pool import Run, cached_runner, open_runner
@@ -190,7 +191,7 @@ def _measure(
             raise KeyError(experiment.name)
     total = summarise(results)
     floors = {
-        name: tracking_floor(config.command, a, end=config.duration)
+        name: tracking_floor(build_command(config.command), a, end=config.duration)
         for name, a in (("4_mps2", ACCELERATION), ("mu_g", config.sim.friction * GRAVITY))
     }
     rows = [_row(row, total, floors, results) for row in experiment.rows]

@@ -76,6 +76,7 @@ def _key(cache: Cache, kind: str, args: Any) -> str:
 def record(kind: str, args: Any, folder: Path) -> list[Episode]:
     """Episodes of a kind, from the folder where they lie there already."""
     from kjax.sim.engines.mujoco_batch import BatchEngine
+    from kjax.sim.resolve import batch_spec, resolve_episodes
 
     there = kept(kind, args, folder)
     if there is not None:
@@ -85,7 +86,7 @@ def record(kind: str, args: Any, folder: Path) -> list[Episode]:
     cache = open_cache(folder, Path(__file__))
     print(f"{kind}: recording {args.robots} episodes of {args.duration:g} s ...", flush=True)
     begin = time.perf_counter()
-    run = BatchEngine(configs[0], torques="held").run(configs)
+    run = BatchEngine(batch_spec(configs[0]), torques="held").run(resolve_episodes(configs))
     if run.interrupted:
         raise KeyboardInterrupt
     log, steps = run.log, np.arange(len(run.log.x)) * DT

@@ -68,8 +68,8 @@ def test_a_sample_is_drawn_from_the_ranges_and_again_the_same(file):
     ("old", "new", "said"),
     [
         ('"= speed"', '"= sped"', r"set\.command\.v_x: no axis named 'sped'"),
-        ('"= speed"', '"= __import__(1)"', r"wanted numbers, axes and"),
-        ('"= speed"', '"= speed +"', r"wanted numbers, axes and"),
+        ('"= speed"', '"= __import__(1)"', r"wanted literals, axes and"),
+        ('"= speed"', '"= speed +"', r"wanted literals, axes and"),
         (
             "duty * 0.4",
             "-2 + duty * 0.4",
@@ -106,7 +106,7 @@ def test_a_mistake_is_one_line_that_names_the_key(file, old, new, said):
 
 @pytest.mark.parametrize("text", ["= word * 2", "= word + word", "= -word", "= 1 + 2j", "= True"])
 def test_words_are_not_counted_with(text):
-    with pytest.raises(ConfigError, match=r"set\.key: got '= .*wanted numbers"):
+    with pytest.raises(ConfigError, match=r"set\.key: got '= .*wanted literals"):
         evaluate(text[1:].strip(), {"word": "flight", "flag": True}, "set.key")
     assert evaluate("word", {"word": "flight"}, "set.key") == "flight"
 
