@@ -30,9 +30,11 @@ from kjax.prediction import families, learned, storage
 from kjax.robots import get_robot
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.intervals import bootstrap
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.types import MODE_ALPHA, Mode
+from kjax.viz.tables import markdown_table
 
 DT, STEPS, ROLLOUTS = 1e-3, 100, 100
 TRAIN_SEED, HELD_OUT_SEED, HELD_OUT = 100, 200, 32
@@ -77,12 +79,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{name}: velocity 50 ms ahead {result[name]['velocity_error_50ms_rms']:.3g} m/s, "
               f"held-out cost {result[name]['held_out_cost']:.3f}", flush=True)  # fmt: skip
     result["own_linear_model"] = {"mujoco": walk(args, None)}
-    rng = np.random.default_rng(0)
-    rows = rng.integers(0, HELD_OUT, (2000, HELD_OUT))
     first, second = (np.asarray(result[n]["held_out_cost_each"]) for n in models)
-    ratio = second[rows].mean(axis=1) / first[rows].mean(axis=1)
     result["cost_ratio"] = float(second.mean() / first.mean())
-    result["cost_ratio_low"], result["cost_ratio_high"] = np.quantile(ratio, [0.025, 0.975])
+    result["cost_ratio_low"], result["cost_ratio_high"] = bootstrap(
+        lambda a, b: b.mean(axis=1) / a.mean(axis=1), first, second
+    )
     cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
     (folder / "table.md").write_text(table(result), encoding="utf-8")
     figure(result, folder / "figure.png")
@@ -204,29 +205,25 @@ def walk(args: argparse.Namespace, path: Path | None) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """Markdown."""
-    lines = [
-        "| trained for | velocity error, 50 ms, rms [m/s] | held-out cost | MuJoCo: fell | "
-        "RMSE of v_x [m/s] | cost |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name in ("prediction", "prediction and control", "own_linear_model"):
         entry = result[name]
         walked = entry["mujoco"]
         rmse = walked.get("velocity_rmse_mps")
-        ahead = (
-            f"{entry['velocity_error_50ms_rms']:.3g} | {entry['held_out_cost']:.3f}"
-            if "held_out_cost" in entry else "- | -"
+        ahead = ("-", "-")
+        if "held_out_cost" in entry:
+            ahead = (f"{entry['velocity_error_50ms_rms']:.3g}", f"{entry['held_out_cost']:.3f}")
+        rows.append(
+            (name.replace("_", " "), *ahead, f"{walked['falls']} of {walked['runs']}",
+             f"{rmse['median']:.4f} ({rmse['worst']:.4f})" if rmse else "-",
+             f"{walked['cost_median']:.3f}")
         )  # fmt: skip
-        lines.append(
-            f"| {name.replace('_', ' ')} | {ahead} | {walked['falls']} of {walked['runs']} | "
-            + (f"{rmse['median']:.4f} ({rmse['worst']:.4f})" if rmse else "-")
-            + f" | {walked['cost_median']:.3f} |"
-        )
-    lines.append(
+    header = ("trained for", "velocity error, 50 ms, rms [m/s]", "held-out cost", "MuJoCo: fell",
+              "RMSE of v_x [m/s]", "cost")  # fmt: skip
+    return markdown_table(header, rows) + (
         f"\nHeld-out cost with control over without: {result['cost_ratio']:.3f} "
-        f"({result['cost_ratio_low']:.3f} to {result['cost_ratio_high']:.3f})"
+        f"({result['cost_ratio_low']:.3f} to {result['cost_ratio_high']:.3f})\n"
     )
-    return "\n".join(lines) + "\n"
 
 
 def figure(result: dict[str, Any], path: Path) -> None:

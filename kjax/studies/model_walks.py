@@ -10,6 +10,7 @@ import dataclasses
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,9 @@ from kjax import cli
 from kjax.config import Gaits, RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.runs.cache import Cache, open_cache
+from kjax.sim.intervals import bootstrap
 from kjax.studies.prediction_models import MODELS, residual
+from kjax.viz.tables import markdown_table
 
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
 SPEEDS = {"trot": (0.0, 0.3, 0.6), "bound": (0.0, 0.5, 0.8)}  # m/s, one after the other
@@ -198,28 +201,25 @@ def statistics(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Falls; medians of those that stayed up, with the interval of the median (95 %, bootstrap)."""
     up = [row for row in rows if not row["fell"]]
     out: dict[str, Any] = {"episodes": len(rows), "falls": len(rows) - len(up)}
-    rng = np.random.default_rng(0)
     for name, key in (("rmse", "velocity_rmse_mps"), ("pitch", "pitch_p95_deg")):
         values = np.array([row[key] for row in up]) if up else np.array([np.nan])
-        draws = np.median(rng.choice(values, (2000, len(values))), axis=1)
         out[f"{name}_median"] = float(np.median(values))
-        out[f"{name}_low"], out[f"{name}_high"] = map(float, np.quantile(draws, [0.025, 0.975]))
+        out[f"{name}_low"], out[f"{name}_high"] = bootstrap(partial(np.median, axis=1), values)
     return out
 
 
 def table(walks: dict[str, Any]) -> str:
     """Markdown."""
-    lines = [
-        "| gait, model | rmse of v_x, tuned [m/s] | fell | pitch, 95 % [deg] | not tuned | fell |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for label, entry in walks.items():
         tuned, own = entry["tuned"], entry["own_weights"]
-        lines.append(
-            f"| {label} | {_interval(tuned, 'rmse')} | {tuned['falls']} of {tuned['episodes']} | "
-            f"{_interval(tuned, 'pitch')} | {_interval(own, 'rmse')} | {own['falls']} |"
-        )
-    return "\n".join(lines) + "\n"
+        rows.append(
+            (label, _interval(tuned, "rmse"), f"{tuned['falls']} of {tuned['episodes']}",
+             _interval(tuned, "pitch"), _interval(own, "rmse"), str(own["falls"]))
+        )  # fmt: skip
+    header = ("gait, model", "rmse of v_x, tuned [m/s]", "fell", "pitch, 95 % [deg]", "not tuned",
+              "fell")  # fmt: skip
+    return markdown_table(header, rows)
 
 
 def _interval(entry: dict[str, Any], name: str) -> str:

@@ -10,7 +10,7 @@ from kjax.gait import Gait, phases
 from kjax.runs.cache import Cache
 from kjax.sim.resolve import batch_spec
 from kjax.studies import envelope
-from kjax.studies.reproduce import paper_results
+from kjax.studies.reproduce import page, paper_results
 from kjax.studies.reproduce import study as reproduce
 
 
@@ -88,8 +88,8 @@ def test_the_cost_of_held_torques_is_counted_field_by_field():
     assert rmse["n"] == 16
     assert (rmse["median"], rmse["low"], rmse["high"]) == pytest.approx((0.02, 0.02, 0.02))
     assert cost["field_pitch_p95_deg"] == {"n": 0, "median": None, "low": None, "high": None}
-    rows = reproduce._held_rows("rough", "free", cost)
-    assert all(len(row) == len(reproduce.HEADER) for row in rows)
+    rows = page._held_rows("rough", "free", cost)
+    assert all(len(row) == len(page.HEADER) for row in rows)
     assert rows[0][5:7] == ["16 of 18", "67.2 to 96.9 %"]  # Wilson's, by hand
     assert "2 lost, 2 gained" in rows[1][2]
 
@@ -104,8 +104,8 @@ def test_numbers_stand_beside_their_intervals():
     assert (falls["low"], falls["high"]) == pytest.approx((0.0105, 0.2698), abs=1e-4)
     few = judge(row(metric="a", label=""), total, {}, results[:4])
     assert (few["low"], few["high"]) == (None, None)
-    assert reproduce._interval(few) == ""
-    assert reproduce._interval(falls, percent=True) == "1.0 to 27.0 %"
+    assert page._interval(few) == ""
+    assert page._interval(falls, percent=True) == "1.0 to 27.0 %"
 
 
 def test_rough_ground_is_walked_on_256_fields():
@@ -282,8 +282,8 @@ def test_a_quick_reproduction_leaves_page_table_and_json_and_goes_on(
     assert one["rows"][0]["target"] == 0.98
     assert one["held"]["cost"]["crossed"]["fields"] == 2
     assert len(Cache(tmp_path)) == 4
-    page = (tmp_path / "index.html").read_text()
-    assert "figures/trot_rough_planar.png" in page
+    html = (tmp_path / "index.html").read_text()
+    assert "figures/trot_rough_planar.png" in html
     assert (tmp_path / "figures" / "trot_rough_planar.png").exists()
     assert "rough trot" in (tmp_path / "table.md").read_text()
     assert "rough trot, 0.3 m/s, torques held" in (tmp_path / "table.md").read_text()

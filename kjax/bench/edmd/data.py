@@ -17,6 +17,11 @@ from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 PAPER = observables.paper(4)
+SEEDS = 10  # data sets
+# (order, with the constant rotation): the paper's first, all of them parts of the largest.
+DICTIONARIES = tuple((order, constant) for order in (4, 3, 2, 1, 0) for constant in (False, True))
+VELOCITIES = slice(3, 6)  # of a state
+LOOP = 20  # rollouts of the loop over rollouts and steps; the others by proportion
 
 
 class Setting(NamedTuple):
@@ -52,7 +57,9 @@ def sampler(here: Setting, rollouts: int, steps: int) -> Callable[[jax.Array], S
     )
 
 
-def numpy_draw(rng: np.random.Generator, here: Setting, count: int) -> tuple[np.ndarray, ...]:
+def numpy_draw(
+    rng: np.random.Generator, here: Setting, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Initial states (count, 6) and forces (count, steps, 4) in the ranges of the setting."""
     ranges = jax.tree.map(np.asarray, here.ranges)
     x0 = ranges.state_centre + ranges.state_half * rng.uniform(-1.0, 1.0, (count, 6))

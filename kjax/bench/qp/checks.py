@@ -3,7 +3,7 @@
 The judges here are plain NumPy and finite differences; nothing of ``kjax.qp`` judges itself.
 """
 
-import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,14 @@ import numpy as np
 from tqdm import tqdm
 
 from kjax import qp
+from kjax.bench.timing import Call, median_us
 
 TOLERANCE = 1e-9
 SIZES = (4, 8, 16, 24, 40, 60)
 TICKS = 64  # problems of a sequence, each warm-started by the one before
 BATCH = 128  # sequences side by side
 WEAK = 1e-4  # margin under which a bound counts as weakly active
+_median_us = partial(median_us, indices=range(40), warm_up=1)
 
 
 # ---------------------------------------------------------------- gradients
@@ -115,7 +117,8 @@ def _sequence(H: Any, q: Any, lower: Any, upper: Any) -> Any:
     prepared = qp.prepare(H)
 
     def tick(warm: Any, row: Any) -> Any:
-        solution = qp.solve(prepared, *row, warm, tolerance=TOLERANCE)
+        q, lower, upper = row
+        solution = qp.solve(prepared, q, lower, upper, warm, tolerance=TOLERANCE)
         return solution.warm, (solution.x, solution.status)
 
     return jax.lax.scan(tick, qp.start(prepared), (q, lower, upper))[1]
@@ -190,7 +193,7 @@ def public_problems(folder: Path, peers: dict[str, Any]) -> dict[str, Any]:
         x, y = np.asarray(solution.x), np.asarray(solution.multipliers)
         error = _gap(P, q, C, np.r_[low, lower], np.r_[high, upper], x, y)
         residuals.append(error)
-        ours.append(_median_us(lambda s=solve, a=arguments: np.asarray(s(*a).x)))
+        ours.append(_median_us(_x_of(solve, arguments)))
         if "daqp" in peers:
             theirs.append(_median_us(_by_daqp(P, q, C, low, high, lower, upper)))
     ratio = np.divide(ours, theirs) if theirs else np.array([np.nan])
@@ -202,6 +205,10 @@ def public_problems(folder: Path, peers: dict[str, Any]) -> dict[str, Any]:
         "over_daqp_median": float(np.median(ratio)),
         "over_daqp_max": float(np.max(ratio)),
     }
+
+
+def _x_of(solve: Callable[..., Any], arguments: tuple[Any, ...]) -> Call:
+    return lambda _: np.asarray(solve(*arguments).x)
 
 
 def _as_rows(read: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
@@ -246,19 +253,9 @@ def _by_daqp(
 
     top, bottom = (np.clip(np.r_[a], -1e30, 1e30) for a in ((*upper, *high), (*lower, *low)))
     sense = np.zeros(len(top), np.int32)
-    return lambda: daqp.solve(
+    return lambda _: daqp.solve(
         P, q, np.ascontiguousarray(C), top, bottom, sense, primal_tol=TOLERANCE, dual_tol=TOLERANCE
     )
-
-
-def _median_us(call: Any, repeats: int = 40) -> float:
-    call()
-    times = []
-    for _ in range(repeats):
-        clock = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - clock)
-    return 1e6 * float(np.median(times))
 
 
 # ---------------------------------------------------------------- long horizons
@@ -307,6 +304,9 @@ def riccati_step(steps: int, states: int, inputs: int) -> dict[str, float]:
 
     times = {}
     for name, step in (("riccati, scan", in_sequence), ("riccati, associative", in_parallel)):
-        call = jax.jit(step)
-        times[name] = _median_us(lambda call=call: jax.block_until_ready(call(R)))
+        times[name] = _median_us(partial(_on, jax.jit(step), R))
     return times
+
+
+def _on(call: Callable[[Any], Any], argument: Any, _: int) -> Any:
+    return call(argument)

@@ -14,7 +14,6 @@ from kjax.config.shipped import shipped_config
 from kjax.controllers import planning
 from kjax.controllers.controller import build_controller
 from kjax.controllers.resolve import controller_spec
-from kjax.mpc import lmpc, multiphase
 from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
 
@@ -59,9 +58,10 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
             return real(prepared, q, lower, upper, *args, **options)
 
         real = qp.solve
-        with mock.patch.object(lmpc.qp, "solve", solve):
+        with mock.patch.object(qp, "solve", solve):
             plan = own(tables, task)
-        return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
+        recorded: Any = (task.mode, seen["q"], seen["lower"], seen["upper"])
+        return plan._replace(memory=recorded)
 
     mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
     hessian = MujocoEngine(config).program(config).tables.lmpc.hessian
@@ -92,8 +92,8 @@ def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
         real = qp.solve_rows
         # The planner holds both horizons behind a cond, whose tracers may not leave it.
         with (
-            mock.patch.object(multiphase.qp, "solve_rows", solve),
-            mock.patch.object(planning.jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
+            mock.patch.object(qp, "solve_rows", solve),
+            mock.patch.object(jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
         ):
             plan = own(tables, task)
         return plan._replace(memory=seen[0])

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,9 @@ import jax
 import mujoco.batch
 import numpy as np
 
+from kjax.bench.machine import cores, peak_memory, two_process_speedup
 from kjax.bench.simulation import report
+from kjax.bench.timing import Call, elapsed, interleaved, median_ratio, reported
 from kjax.config import RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.robots import get_robot
@@ -43,7 +44,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", False)
     batches = BATCHES[:3] if quick else BATCHES
     rounds = 2 if quick else ROUNDS
-    result: dict[str, Any] = {"threads": len(_cores()), "c": {}, "mjx": {}}
+    result: dict[str, Any] = {"threads": len(cores()), "c": {}, "mjx": {}}
     for gait, torques in (("trot", "held"), ("trot", "every_step"), ("bound", "held")):
         sizes = batches if (gait, torques) == ("trot", "held") else batches[-1:]
         for size in sizes:
@@ -61,7 +62,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     if not quick:
         result |= elsewhere("engines_agree()")
         result |= mjx_compile_times()
-        result["machine_two_process_speedup"] = machine_speedup()
+        result["machine_two_process_speedup"] = two_process_speedup()
         result |= two_processes(folder)
     result |= headline(result)
     (folder / "table.md").write_text(report.table(result), encoding="utf-8")
@@ -110,19 +111,20 @@ def c_batch(gait: str, torques: Any, size: int, rounds: int) -> dict[str, float]
     steps = size * round(seconds / configs[0].sim.sim_dt)
     per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
     walked = int(recording.ticks.sum()) * per_tick  # fewer steps where a robot fell
-    closed_times, bare_times = [], []
-    for _ in range(rounds):
-        closed_times.append(engine.run(configs).wall_time)
-        bare_times.append(bare())
-    ratios = np.array(bare_times) / np.array(closed_times) * walked / steps
+    calls: dict[str, Call] = {
+        "closed": lambda _: engine.run(configs).wall_time,
+        "bare": lambda _: bare(),
+    }
+    times = interleaved(calls, rounds, warm_up=0, measure=reported)
+    ratios = times["bare"] / times["closed"] * walked / steps
     return {
-        "robot_steps_per_s": walked / float(np.median(closed_times)),
-        "bare_robot_steps_per_s": steps / float(np.median(bare_times)),
+        "robot_steps_per_s": walked / float(np.median(times["closed"])),
+        "bare_robot_steps_per_s": steps / float(np.median(times["bare"])),
         "over_bare": float(np.median(ratios)),
         "over_bare_min": float(ratios.min()),
         "over_bare_max": float(ratios.max()),
         "falls": int(recording.fell.sum()),
-        "resident_MB": _resident(),
+        "resident_MB": peak_memory(),
     }
 
 
@@ -199,21 +201,19 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     bare = jax.jit(jax.vmap(walk, (0, 1)))
     torque = recording.torque[: len(recording.qpos)][..., order]
     jax.block_until_ready(bare(data, torque))
-    closed_times, bare_times = [], []
-    for _ in range(rounds):
-        closed_times.append(engine.run(configs).wall_time)
-        clock = time.perf_counter()
-        jax.block_until_ready(bare(data, torque))
-        bare_times.append(time.perf_counter() - clock)
-    ratios = np.array(bare_times) / np.array(closed_times)
+    calls: dict[str, Call] = {
+        "closed": lambda _: engine.run(configs).wall_time,
+        "bare": lambda _: elapsed(bare, data, torque),
+    }
+    times = interleaved(calls, rounds, warm_up=0, measure=reported)
     return {
-        "robot_steps_per_s": size * steps / float(np.median(closed_times)),
-        "bare_robot_steps_per_s": size * steps / float(np.median(bare_times)),
-        "over_bare": float(np.median(ratios)),
-        "compile_s": first - float(np.median(closed_times)),
+        "robot_steps_per_s": size * steps / float(np.median(times["closed"])),
+        "bare_robot_steps_per_s": size * steps / float(np.median(times["bare"])),
+        "over_bare": median_ratio(times["bare"], times["closed"]),
+        "compile_s": first - float(np.median(times["closed"])),
         "traces": engine.traces,
         "falls": int(recording.fell.sum()),
-        "resident_MB": _resident(),
+        "resident_MB": peak_memory(),
     }
 
 
@@ -299,20 +299,6 @@ def mjx_compile_times() -> dict[str, float]:
     return {"mjx_compile_s_cold": times[0], "mjx_compile_s_cached": times[1]}
 
 
-def machine_speedup() -> float:
-    """What two processes that share nothing gain over one: the most that can be had here."""
-    code = "x = 0\nfor i in range(20_000_000): x += i * i"
-
-    def once(count: int) -> float:
-        clock = time.perf_counter()
-        running = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(count)]
-        for process in running:
-            process.wait()
-        return (time.perf_counter() - clock) / count
-
-    return float(np.median([once(1) / once(2) for _ in range(3)]))
-
-
 def two_processes(folder: Path) -> dict[str, float]:
     """A sweep on two processes of one thread each beside one, both compiled before.
 
@@ -341,7 +327,7 @@ def two_processes(folder: Path) -> dict[str, float]:
                 "--coordinator", "127.0.0.1:12355", "--processes", str(count),
                 "--process", str(number),
             ]  # fmt: skip
-            pin = ["taskset", "-c", str(_cores()[number % len(_cores())])]
+            pin = ["taskset", "-c", str(cores()[number % len(cores())])]
             running.append(
                 subprocess.Popen(
                     [*pin, *common, *more, "--out", str(out)],
@@ -358,12 +344,3 @@ def two_processes(folder: Path) -> dict[str, float]:
     once(1, "--seeds", "64")
     (alone, one), (together, two) = once(1), once(2)
     return {"two_process_speedup": two / one, "two_process_speedup_whole": alone / together}
-
-
-def _cores() -> list[int]:
-    return sorted(os.sched_getaffinity(0))
-
-
-def _resident() -> float:
-    """Largest resident memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

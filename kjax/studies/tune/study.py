@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
 from tqdm import tqdm
 
@@ -29,8 +28,9 @@ from kjax.runs.cache import Cache, open_cache
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.summary import summarise
+from kjax.studies.tune import report
 from kjax.tuning import loop
-from kjax.tuning.optimise import build_objective, descend
+from kjax.tuning.optimise import Descent, build_objective, descend
 from kjax.tuning.space import TUNABLE, Space, Variables, build_space, shown, tuned_config
 
 TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
@@ -71,20 +71,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     own_cost, begin_cost = float(look(space.start)), float(look(begin))
     print(f"cost on {args.held_out} held-out scenarios: the config's own numbers {own_cost:.3f}, "
           f"the start {begin_cost:.3f}", flush=True)  # fmt: skip
-    with tqdm(total=args.updates, unit="update", disable=None) as bar:
-
-        def show(number: int, value: float, best: float) -> None:
-            bar.n = number
-            bar.set_postfix_str(f"cost {value:.3f}, held out {best:.3f}")
-
-        try:
-            result = descend(
-                objective, space, train, held_out, start=begin, updates=args.updates,
-                rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
-                checkpoint=cache.path(key, ".npz"), identity=key, on_update=show,
-            )  # fmt: skip
-        except ValueError as error:
-            cli.fail(str(error))
+    result = _descend(objective, space, (train, held_out), begin, args, cache.path(key, ".npz"))
     print(f"descent: {len(result.cost)} updates in {result.seconds:.0f} s, held-out cost "
           f"{result.best_cost:.3f} after update {result.best_update} (ended by: {result.stopped})",
           flush=True)  # fmt: skip
@@ -101,13 +88,66 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     verdict = {name: walk(config, space.overrides(z), args.seeds) for name, z in sets.items()}
     cli.save_config(folder / "tuned.toml", tuned_config(config, space.overrides(result.best)))
     record = {
+        **_record(args, result, searches),
+        "held_out_cost": costs,
+        "cost_over_own": {name: value / costs["own"] for name, value in costs.items()},
+        "values": {name: space.overrides(z) for name, z in sets.items()},
+        "mujoco": verdict,
+    }
+    cli.save_json(folder / "metrics.json", record)
+    text = report.table(record)
+    (folder / "table.md").write_text(text, encoding="utf-8")
+    runs = traces(short, space, sets, held_out)
+    report.figure(record, runs, short, folder / "figure.png")
+    print(text)
+    print(f"results in {folder}/")
+    if not result.healthy:
+        cli.fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
+
+
+def _descend(
+    objective: Any,
+    space: Space,
+    scenarios: tuple[loop.Scenario, loop.Scenario],
+    begin: Variables,
+    args: Namespace,
+    checkpoint: Path,
+) -> Descent:
+    """The descent on the training scenarios, with a bar of its progress; kept as it goes.
+
+    Args:
+      objective: cost of variables on a scenario.
+      space: of the variables.
+      scenarios: to descend on, and held out.
+      begin: where it starts.
+      args: of the command line.
+      checkpoint: file that it is kept in, named by the key of all that it depends on.
+    """
+    with tqdm(total=args.updates, unit="update", disable=None) as bar:
+
+        def show(number: int, value: float, best: float) -> None:
+            bar.n = number
+            bar.set_postfix_str(f"cost {value:.3f}, held out {best:.3f}")
+
+        try:
+            return descend(
+                objective, space, *scenarios, start=begin, updates=args.updates,
+                rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
+                checkpoint=checkpoint, identity=checkpoint.stem, on_update=show,
+            )  # fmt: skip
+        except ValueError as error:
+            cli.fail(str(error))
+
+
+def _record(
+    args: Namespace, result: Descent, searches: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """What metrics.json says of how the parameters were found."""
+    return {
         "provenance": cli.provenance(),
         "keys": list(args.keys),
         "worsen": args.worsen,
         "scenarios": {"train": args.scenarios, "held_out": args.held_out, "seconds": args.seconds},
-        "held_out_cost": costs,
-        "cost_over_own": {name: value / costs["own"] for name, value in costs.items()},
-        "values": {name: space.overrides(z) for name, z in sets.items()},
         "descent": {
             "updates": len(result.cost), "seconds": result.seconds, "stopped": result.stopped,
             "best_update": result.best_update, "cost": result.cost,
@@ -117,17 +157,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
             name: {k: v for k, v in found.items() if k != "best"}
             for name, found in searches.items()
         },
-        "mujoco": verdict,
     }  # fmt: skip
-    cli.save_json(folder / "metrics.json", record)
-    text = table(record)
-    (folder / "table.md").write_text(text, encoding="utf-8")
-    runs = traces(short, space, sets, held_out)
-    figure(record, runs, short, folder / "figure.png")
-    print(text)
-    print(f"results in {folder}/")
-    if not result.healthy:
-        cli.fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
 
 
 def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
@@ -330,51 +360,3 @@ def traces(
     run = jax.jit(loop.build_loop(config))
     one = jax.tree.map(lambda a: a[0], scenarios)
     return {name: jax.device_get(run(space.params(z), one)) for name, z in sets.items()}
-
-
-def table(record: dict[str, Any]) -> str:
-    """Markdown."""
-    lines = [
-        "| numbers | held-out cost, rigid body | MuJoCo: fell | RMSE of v_x [m/s] | "
-        "pitch, 95 % [deg] | cost |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, entry in record["mujoco"].items():
-
-        def cell(key: str, entry: dict[str, Any] = entry) -> str:
-            if key not in entry:
-                return "-"
-            return f"{entry[key]['median']:.3g} ({entry[key]['worst']:.3g})"
-
-        lines.append(
-            f"| {name} | {record['held_out_cost'][name]:.3f} | {entry['falls']} of "
-            f"{entry['runs']} | {cell('velocity_rmse_mps')} | {cell('pitch_p95_deg')} | "
-            f"{entry['cost_median']:.3f} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path: Path) -> None:
-    """Loss curve; one held-out scenario before and after."""
-    fig, (curve, speed, pitch) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
-    descent, costs = record["descent"], record["held_out_cost"]
-    curve.plot(descent["cost"], lw=0.8, label="training scenarios")
-    curve.plot(descent["checks"], descent["held_out"], "o-", ms=2.5, label="held out")
-    curve.axhline(costs["own"], color="k", ls="--", lw=0.8, label="config's own numbers")
-    curve.set(xlabel="update of Adam", ylabel="cost [-]", yscale="log")
-    curve.legend(fontsize=7)
-    dt = config.lmpc.control_dt
-    first = next(iter(runs.values()))
-    time_axis = np.arange(len(first.x)) * dt
-    speed.plot(time_axis, first.wanted[:, 0], "k--", lw=0.9, label="reference")
-    for name, run in runs.items():
-        shown = np.where(run.alive[:, None], run.x, np.nan)
-        speed.plot(time_axis, shown[:, 3], lw=0.9, label=name)
-        pitch.plot(time_axis, np.degrees(shown[:, 2]), lw=0.9, label=name)
-    speed.set(xlabel="time [s]", ylabel="v_x [m/s]", title="a held-out scenario, rigid body")
-    pitch.set(xlabel="time [s]", ylabel="pitch [deg]")
-    speed.legend(fontsize=7)
-    for ax in (curve, speed, pitch):
-        ax.grid(alpha=0.3)
-    fig.savefig(path, dpi=120)
-    plt.close(fig)
