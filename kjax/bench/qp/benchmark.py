@@ -128,7 +128,10 @@ def box_single(log: dict[str, Any], peers: dict[str, Any], count: int = 400) -> 
     ticks, prepared = range(len(q)), log["prepared"]
 
     # Bounds change with the mode only: they stay in the compiled program, as H does.
-    bounds = {int(m): (lower[mode == m][0], upper[mode == m][0]) for m in np.unique(mode)}
+    bounds = {
+        int(m): (jnp.asarray(lower[mode == m][0]), jnp.asarray(upper[mode == m][0]))
+        for m in np.unique(mode)
+    }
     calls = {
         m: jax.jit(_one_mode(jax.tree.map(lambda a, m=m: a[m], prepared), *sides))
         for m, sides in bounds.items()
