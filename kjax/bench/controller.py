@@ -23,7 +23,7 @@ from kjax.sim.noise import noise_dim
 from kjax.sim.program import requests
 
 CALLS = 2000  # timed calls of each function
-WALK = 400  # ms of walking from which the timed inputs are taken
+EPISODE = 400  # physics steps of the closed loop that the timed inputs are taken from
 
 
 def run(config: RunConfig, args: argparse.Namespace) -> dict[str, Any]:
@@ -37,9 +37,9 @@ def run(config: RunConfig, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def controller_latency(config: RunConfig) -> dict[str, Any]:
-    """Latency of the compiled calls on inputs from a walk, and of their floors [ms]."""
+    """Latency of the compiled calls on inputs from a closed loop, and of their floors [ms]."""
     simulation = MujocoEngine(config)
-    states, sensed, data = _walk(simulation)
+    states, sensed, data = _episode(simulation)
     program = simulation.program(config)
     noop = jax.jit(lambda state, sensed: (state + 1.0, sensed[:12] * 2.0))
 
@@ -63,8 +63,8 @@ def controller_latency(config: RunConfig) -> dict[str, Any]:
     return result
 
 
-def _walk(simulation: MujocoEngine) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
-    """Controller states and sensor vectors along a walk, and the data at its end."""
+def _episode(simulation: MujocoEngine) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
+    """Controller states and sensor vectors along an episode, and the data at its end."""
     model, config = simulation.model, simulation.config
     program = simulation.program(config)
     data = mujoco.MjData(model)
@@ -73,7 +73,7 @@ def _walk(simulation: MujocoEngine) -> tuple[list[Any], list[np.ndarray], mujoco
     states, sensed = [], []
     noise = noise_dim(config.sim.base) * config.noise.enabled
     state = None
-    for i in range(WALK):
+    for i in range(EPISODE):
         now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(noise)])
         state = program.init(now, requests(config)) if state is None else state
         if i % 5 == 0:

@@ -134,9 +134,9 @@ def _parse(argv: Sequence[str] | None) -> Namespace:
     parser.add_argument("--gaits", nargs="+", choices=tuple(GAITS), default=list(GAITS))
     parser.add_argument("--checks", nargs="+", choices=tuple(LIMITS), default=list(LIMITS))
     parser.add_argument("--residual", type=Path, metavar="FILE", help="a residual of "
-                        "whole_body.py: walk with it in trot as well")  # fmt: skip
+                        "whole_body.py: run it in trot as well")  # fmt: skip
     parser.add_argument("--learned", type=Path, metavar="FILE", help="a model of learn_control.py: "
-                        "walk with it as well")  # fmt: skip
+                        "run it as well")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=16, help="of the bound in float64")
     parser.add_argument("--threads", type=int, default=None, help="one per core by default")
     parser.add_argument("--quick", action="store_true",
@@ -161,12 +161,12 @@ def _namespace(args: Namespace, **more: Any) -> Namespace:
 
 
 def _known(args: Namespace) -> list[str]:
-    """All models that this call could walk with."""
+    """All models that this call could run."""
     return [*ROWS, *(name for name in ("residual", "learned") if getattr(args, name) is not None)]
 
 
 def _parts(args: Namespace) -> Iterator[Part]:
-    """The batches of a call; the checks in turn, so that the first ones are whole early on."""
+    """The batches of a call, check by check, so that the first ones are whole early on."""
     for check in args.checks:
         for model in args.models:
             for gait in args.gaits:
@@ -300,7 +300,7 @@ def table(found: Sequence[dict[str, Any]], *, quick: bool) -> str:
         "(0, 0). Falls must be the same in every cell as well.",
     ]
     if quick:
-        lines.append("\nA quick check of the machinery: these numbers are no result.")
+        lines.append("\nA quick check of the machinery: this is no result.")
     return "\n".join(lines) + "\n"
 
 

@@ -60,7 +60,7 @@ PITCH = {SMALL: 5.0, LARGE: 8.0}  # deg
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class Setting:
     """A gait on a base with one kind of force limits.
 
     Attributes:
@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.configure_jax()
     cache = open_cache(folder, Path(__file__))
     chosen = [
-        Case(gait=gait, base=base, forces=forces)
+        Setting(gait=gait, base=base, forces=forces)
         for forces in args.forces for gait in args.gaits for base in args.bases
     ]  # fmt: skip
     try:
@@ -139,7 +139,9 @@ def _parse(argv: Sequence[str] | None) -> Namespace:
     return args
 
 
-def steps_of(case: Case, start: float, args: Namespace) -> Iterator[tuple[float, list[RunConfig]]]:
+def steps_of(
+    case: Setting, start: float, args: Namespace
+) -> Iterator[tuple[float, list[RunConfig]]]:
     """Velocities after a step from ``start``, and the configs of all seeds."""
     earliest, values = STEPS[start]
     if args.quick:
@@ -186,7 +188,7 @@ def _scene(name: str, base: str, contacts: str) -> tuple[Any, Any]:
     return model, find_addresses(robot, model)
 
 
-def measured(case: Case, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
+def measured(case: Setting, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
     """Falls, body contacts and pitch of each step of a finished case."""
     rows = []
     for start in STEPS:
@@ -219,7 +221,7 @@ def measured(case: Case, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
     return rows
 
 
-def _sentence(case: Case, rows: Sequence[dict[str, Any]]) -> str:
+def _sentence(case: Setting, rows: Sequence[dict[str, Any]]) -> str:
     falls, touches, over, count = (
         sum(row[key] for row in rows)
         for key in ("falls", "body_contacts", "pitch_over", "episodes")
@@ -237,7 +239,7 @@ def _finished(cache: Cache, args: Namespace) -> Iterator[dict[str, Any]]:
     for forces in FORCES:
         for gait in GAITS:
             for base in BASES:
-                case = Case(gait=gait, base=base, forces=forces)
+                case = Setting(gait=gait, base=base, forces=forces)
                 keys = [
                     batch_key(cache, config, "every_step", measure=after_step)
                     for start in STEPS for _, row in steps_of(case, start, args) for config in row
@@ -281,7 +283,7 @@ def table(found: Sequence[dict[str, Any]], *, quick: bool) -> str:
         "but a foot that touches the ground at a control tick, is counted over whole episodes.",
     ]
     if quick:
-        lines.append("\nA quick check of the machinery: these numbers are no result.")
+        lines.append("\nA quick check of the machinery: this is no result.")
     return "\n".join(lines) + "\n"
 
 

@@ -14,7 +14,7 @@ SPACE = SimpleNamespace(start={"a": np.array([0.5, -1.0]), "b": np.array(2.0)})
 
 @pytest.fixture
 def costs(monkeypatch):
-    """Choose the cost of (variables, scenario); scenarios are numbers from 1 on."""
+    """Choose the cost of (variables, scenario); scenarios are 1, 2, 3 and so on."""
     monkeypatch.setattr(gradient, "scenarios_of", lambda config, n: jnp.arange(1.0, n + 1.0))
 
     def choose(cost):

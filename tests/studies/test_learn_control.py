@@ -24,7 +24,7 @@ def trained(monkeypatch):
     def costs_of(params, run):
         return lambda model, scenarios: model * (1.0 + scenarios)
 
-    def walk(args, path):
+    def verdict_of(args, path):
         calls.append(path and path.name)
         return {
             "runs": args.walks, "falls": 1, "cost_median": 0.3,
@@ -42,7 +42,7 @@ def trained(monkeypatch):
         "resolve": lambda config: (None, None),
         "costs_of": costs_of,
         "prediction_errors": errors,
-        "walk": walk,
+        "verdict_of": verdict_of,
     }
     for name, stand_in in stand_ins.items():
         monkeypatch.setattr(learn_control, name, stand_in)

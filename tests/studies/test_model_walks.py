@@ -13,59 +13,59 @@ MODELS = ("linear (the paper)", "SRB re-linearised")
 
 
 @pytest.fixture
-def walks(call, monkeypatch, tmp_path):
+def episodes(call, monkeypatch, tmp_path):
     """Run model_walks.py --quick on trots with a stand-in for episodes; returns those it ran."""
-    walked = []
+    ran = []
 
     def run(configs):
-        walked.extend(configs)
+        ran.extend(configs)
         return [{"fell": False, "velocity_rmse_mps": 0.1, "pitch_p95_deg": 1.0} for _ in configs]
 
     monkeypatch.setattr(model_walks, "run", run)
-    monkeypatch.setattr(model_walks, "figure", lambda walks, path: None)
+    monkeypatch.setattr(model_walks, "figure", lambda found, path: None)
 
     def study(*words):
-        walked.clear()
+        ran.clear()
         words = ("--quick", "--gaits", "trot", "--out", tmp_path, *words)
         assert call(model_walks.main, *words) == 0
-        return list(walked)
+        return list(ran)
 
     return study
 
 
-def test_walks_are_found_again(walks, tmp_path):
-    assert len(walks()) > 0
+def test_episodes_are_found_again(episodes, tmp_path):
+    assert len(episodes()) > 0
     before = json.loads((tmp_path / "metrics.json").read_text())["walks"]
-    assert walks() == []
+    assert episodes() == []
     assert json.loads((tmp_path / "metrics.json").read_text())["walks"] == before
 
 
 @pytest.mark.parametrize("name", ["SPEEDS", "TUNE_SEEDS", "REPORT_SEEDS"])
-def test_edited_lists_are_walked(walks, monkeypatch, name):
-    first = walks()
+def test_edited_lists_are_run(episodes, monkeypatch, name):
+    first = episodes()
     other = {"SPEEDS": {"trot": (0.0, 0.4), "bound": (0.0, 0.5)}}.get(name, range(50, 60))
     monkeypatch.setattr(model_walks, name, other)
-    assert len(walks()) == len(first)
+    assert len(episodes()) == len(first)
     monkeypatch.undo()
 
 
-def test_a_model_with_other_keys_is_walked_and_the_others_are_not(walks, monkeypatch):
-    first = walks()
+def test_a_model_with_other_keys_is_run_and_the_others_are_not(episodes, monkeypatch):
+    first = episodes()
     monkeypatch.setitem(model_walks.MODELS, MODELS[1], {"koopman.model": "planted"})
-    again = walks()
+    again = episodes()
     assert 0 < len(again) < len(first)
     assert {config.koopman.model for config in again} == {"planted"}
 
 
-def test_a_model_that_is_added_to_the_lists_walks_alone(walks, monkeypatch):
-    first = walks()
+def test_a_model_that_is_added_to_the_lists_runs_alone(episodes, monkeypatch):
+    first = episodes()
     real = model_walks.models_of
     more = {"another": {"koopman.model": "planted"}}
     monkeypatch.setattr(model_walks, "models_of", lambda *a: real(*a) | more)
-    assert 0 < len(walks()) < len(first)
+    assert 0 < len(episodes()) < len(first)
 
 
-def test_another_or_a_retrained_residual_is_walked(walks, tmp_path):
+def test_another_or_a_retrained_residual_is_run(episodes, tmp_path):
     def train(folder, value):
         folder.mkdir(exist_ok=True)
         W, spread = np.zeros((len(Mode), 6, 17)), np.full((len(Mode), 6), value)
@@ -76,15 +76,15 @@ def test_another_or_a_retrained_residual_is_walked(walks, tmp_path):
     one, other = tmp_path / "one", tmp_path / "other"
     train(one, 1e-3)
     train(other, 2e-3)
-    assert len(walks("--residual", one)) > 0
-    assert walks("--residual", one) == []
-    again = walks("--residual", other)
+    assert len(episodes("--residual", one)) > 0
+    assert episodes("--residual", one) == []
+    again = episodes("--residual", other)
     assert {config.koopman.model for config in again} == {"residual"}
     train(one, 3e-3)
-    assert {config.koopman.model for config in walks("--residual", one)} == {"residual"}
+    assert {config.koopman.model for config in episodes("--residual", one)} == {"residual"}
 
 
-def test_with_other_code_everything_is_walked(walks, monkeypatch):
-    first = walks()
+def test_with_other_code_everything_is_run(episodes, monkeypatch):
+    first = episodes()
     monkeypatch.setattr("kjax.runs.cache.code_version", lambda *files: "other")
-    assert len(walks()) == len(first)
+    assert len(episodes()) == len(first)

@@ -174,7 +174,7 @@ def test_flat_ground_goes_on_after_ctrl_c_and_leaves_page_table_and_figures(
     lines = (tmp_path / "table.md").read_text().splitlines()
     assert lines[0] == "| " + " | ".join(page.HEADER) + " |"
     assert any(line.startswith("| trot steps, 6 x 1 ms | planar | falls |") for line in lines)
-    assert "A quick check of the machinery: these numbers are no result." in lines
+    assert "A quick check of the machinery: this is no result." in lines
     html = (tmp_path / "index.html").read_text()
     for name in names:
         assert f'<img src="figures/{name}"' in html

@@ -51,7 +51,7 @@ def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(
 @pytest.fixture
 def bowl(monkeypatch):
     """Stand in for closed loops: a cost that is least at the config's own parameters."""
-    log = SimpleNamespace(walked=[])
+    log = SimpleNamespace(tried=[])
 
     def build_objective(config, space, *, memory):
         def objective(variables, scenario):
@@ -60,8 +60,8 @@ def bowl(monkeypatch):
 
         return objective
 
-    def walk(config, overrides, seeds):
-        log.walked.append(overrides)
+    def verdict_of(config, overrides, seeds):
+        log.tried.append(overrides)
         return {"runs": seeds, "falls": 0, "cost_median": 0.5,
                 "velocity_rmse_mps": {"median": 0.02, "worst": 0.03, "n": seeds}}  # fmt: skip
 
@@ -71,7 +71,7 @@ def bowl(monkeypatch):
         )
         return dict.fromkeys(sets, run)
 
-    for stand_in in (build_objective, walk, traces):
+    for stand_in in (build_objective, verdict_of, traces):
         monkeypatch.setattr(study, stand_in.__name__, stand_in)
     return log
 
@@ -92,7 +92,7 @@ def test_a_descent_comes_back_to_the_parameters_that_it_was_put_off(
     np.testing.assert_allclose(values["gradient"]["lmpc.Q"], values["own"]["lmpc.Q"], rtol=0.3)
     off = np.array(values["start"]["lmpc.Q"]) / values["own"]["lmpc.Q"]
     np.testing.assert_allclose(np.maximum(off, 1.0 / off), 3.0, rtol=1e-6)
-    assert [one["lmpc.Q"] for one in bowl.walked] == [
+    assert [one["lmpc.Q"] for one in bowl.tried] == [
         values[name]["lmpc.Q"] for name in ("own", "start", "gradient")
     ]
     tuned = load_config(RunConfig, tmp_path / "tuned.toml")

@@ -1,4 +1,4 @@
-"""Figures and summaries of sweeps, against numbers worked out by hand or by another formula."""
+"""Figures and summaries of sweeps, against values worked out by hand or by another formula."""
 
 import imageio.v2 as imageio
 import numpy as np
@@ -64,14 +64,14 @@ def test_the_summary_holds_shares_and_medians_with_their_intervals(dataset):
     np.testing.assert_array_equal(found["speed"], SPEEDS)
     np.testing.assert_allclose(found["success"]["value"], stayed_up() / SEEDS)
     for index, hits in np.ndenumerate(stayed_up()):
-        ends = [found["success"][end][index] for end in ("low", "high")]
-        np.testing.assert_allclose(ends, wilson(int(hits), SEEDS), atol=1e-5)  # as rounded
+        interval = [found["success"][end][index] for end in ("low", "high")]
+        np.testing.assert_allclose(interval, wilson(int(hits), SEEDS), atol=1e-5)  # as rounded
     # Of seeds 2 to 19 at the second speed the median is that of seeds 10 and 11.
     assert found["velocity_rmse_mps"]["value"][0, 1] == pytest.approx(1.0 + 0.105)
-    ends = [found["velocity_rmse_mps"][end][0, 0] for end in ("low", "high")]
+    interval = [found["velocity_rmse_mps"][end][0, 0] for end in ("low", "high")]
     expected = median_interval(0.01 * np.arange(SEEDS))
     # One rank of 20 apart: one interpolates between ranks, the other takes the safe one.
-    np.testing.assert_allclose(ends, expected, atol=0.011)
+    np.testing.assert_allclose(interval, expected, atol=0.011)
 
 
 def test_a_heat_map_shows_the_shares_over_both_axes(drawn, dataset, tmp_path):

@@ -110,7 +110,7 @@ def summary(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def _one_thread() -> None:
-    """Start this program anew with one thread for linear algebra, unless it was started so.
+    """Restart this program with one thread for linear algebra, unless it was started so.
 
     OpenBLAS reads the number when it is loaded, which is before the first line of ours.
     """
@@ -146,7 +146,7 @@ def fits(here: Setting, python: str | None, versions: Any, calls: int) -> dict[s
     for call, _, _ in ours.values():
         jax.block_until_ready(call())
     times: dict[str, dict[str, list[float]]] = {key: {"kjax": []} for key in KEYS}
-    ends = {"kjax": np.asarray(predict(fit(first)[0], test))}
+    predicted = {"kjax": np.asarray(predict(fit(first)[0], test))}
     done: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "data.npz"
@@ -160,7 +160,7 @@ def fits(here: Setting, python: str | None, versions: Any, calls: int) -> dict[s
                 for key in KEYS:
                     values = entry[key] if isinstance(entry[key], list) else [entry[key]]
                     times[key].setdefault(name, []).extend(values)
-                ends[name] = np.asarray(entry["end"])
+                predicted[name] = np.asarray(entry["end"])
                 done[name] = min(entry["many_done"], done.get(name, len(DICTIONARIES) * SEEDS))
     result: dict[str, Any] = {
         key: {name: float(np.median(values)) for name, values in entry.items()}
@@ -172,7 +172,7 @@ def fits(here: Setting, python: str | None, versions: Any, calls: int) -> dict[s
             "max": np.abs(end - truth).max(axis=0)[VELOCITIES],
             "rms": np.sqrt(((end - truth) ** 2).mean(axis=0))[VELOCITIES],
         }
-        for name, end in ends.items()
+        for name, end in predicted.items()
     }
     result["many_timed"] = done
     return result
@@ -237,7 +237,7 @@ def _peers(python: str | None, data: Path) -> dict[str, Any]:
 
 
 def rollouts(here: Setting, count: int, looped: int) -> dict[str, float]:
-    """Rollouts per second, random numbers included: kjax, a NumPy loop, vectorised NumPy."""
+    """Rollouts per second, random draws included: kjax, a NumPy loop, vectorised NumPy."""
     draw, key, rng = sampler(here, count, here.steps), jax.random.key(0), np.random.default_rng(0)
     body, alpha = jax.tree.map(np.asarray, here.body), np.asarray(here.alpha)
     calls: dict[str, Call] = {

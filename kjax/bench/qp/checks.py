@@ -125,24 +125,24 @@ def _sequence(H: Any, q: Any, lower: Any, upper: Any) -> Any:
 
 
 def _draw(rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
-    """H (B, n, n) and sequences q, lower, upper (B, T, n) that walk; all scales are drawn too."""
+    """H (B, n, n), and q, lower, upper (B, T, n) as random walks; all scales are drawn too."""
     shape = (BATCH, TICKS, n)
     basis = np.linalg.qr(rng.normal(size=(BATCH, n, n)))[0]
     condition = 10.0 ** rng.uniform(0, 8, (BATCH, 1))
     spectrum = condition ** -np.linspace(0, 1, n)
     H = np.einsum("bij,bj,bkj->bik", basis, spectrum, basis)
     H = 0.5 * (H + H.transpose(0, 2, 1))
-    walk = rng.normal(size=shape) * np.where(np.arange(TICKS) > 0, 0.3, 1.0)[:, None]
-    pull = np.cumsum(walk, axis=1)
+    steps = rng.normal(size=shape) * np.where(np.arange(TICKS) > 0, 0.3, 1.0)[:, None]
+    pull = np.cumsum(steps, axis=1)
     # Part of the q pull along stiff directions, part along soft ones: 0 to all bounds active.
     q = np.where(rng.random((BATCH, 1, 1)) < 0.5, pull, np.einsum("bij,btj->bti", H, pull))
     width = 10.0 ** rng.uniform(-3, 2, (BATCH, 1, 1)) * rng.random(shape)
-    centre = rng.normal(size=(BATCH, 1, n)) * width
+    middle = rng.normal(size=(BATCH, 1, n)) * width
     kind = rng.random(shape) if rng.random() < 0.5 else rng.random((BATCH, 1, n))
-    lower = np.where(kind < 0.2, -np.inf, centre - width)
-    upper = np.where((kind > 0.1) & (kind < 0.3), np.inf, centre + width)
+    lower = np.where(kind < 0.2, -np.inf, middle - width)
+    upper = np.where((kind > 0.1) & (kind < 0.3), np.inf, middle + width)
     fixed = kind > 0.9
-    lower, upper = np.where(fixed, centre, lower), np.where(fixed, centre, upper)
+    lower, upper = np.where(fixed, middle, lower), np.where(fixed, middle, upper)
     unit = 2.0 ** rng.integers(-20, 21, (BATCH, 1, n))  # of each variable
     cost = 10.0 ** rng.uniform(-8, 8, (BATCH, 1, 1))  # of the objective
     H = H * cost * unit * unit.transpose(0, 2, 1)
@@ -158,10 +158,10 @@ def independent_residual(
     """
     d = np.diagonal(H, axis1=-2, axis2=-1) ** -0.5
     gradient = d * (np.einsum("...ij,...j->...i", H, x) + q)
-    miss = np.median(np.stack([(x - upper) / d, gradient, (x - lower) / d]), axis=0)
+    residual = np.median(np.stack([(x - upper) / d, gradient, (x - lower) / d]), axis=0)
     size = np.maximum(np.abs(d * q).max(-1), np.abs(x / d).max(-1))
     inside = ((lower <= x) & (x <= upper)).all(-1) & np.isfinite(x).all(-1)
-    return np.where(inside, np.abs(miss).max(-1) / np.where(size > 0, size, 1.0), np.inf)
+    return np.where(inside, np.abs(residual).max(-1) / np.where(size > 0, size, 1.0), np.inf)
 
 
 # ---------------------------------------------------------------- public problems

@@ -19,7 +19,7 @@ from kjax.sim.episode import initial_state
 
 
 def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
-    """What ``planner`` returns as memory along a walk of the config's own controller."""
+    """What ``planner`` returns as memory along a closed loop of the config's own controller."""
     simulation = MujocoEngine(config)
     controller, model = build_controller(controller_spec(config)), simulation.model
     tables = simulation.program(config).tables
@@ -32,7 +32,7 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
     state, kept = None, []
     steps = round(seconds / config.sim.sim_dt)
     per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    for i in tqdm(range(steps), desc="walking", leave=False, disable=None):
+    for i in tqdm(range(steps), desc="closed loop", leave=False, disable=None):
         seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
         if state is None:
             state = controller.init(tables, seen)
@@ -46,9 +46,9 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
 
 
 def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
+    """The box QPs of a closed loop: prepared Hessians, modes, q and bounds of every tick."""
     config = load_config(RunConfig, shipped_config(f"{name}.toml"), changes or {})
-    own = planning.build_planner(controller_spec(config))
+    plan_of = planning.build_planner(controller_spec(config))
 
     def planner(tables: Any, task: Any) -> Any:
         seen: dict[str, Any] = {}
@@ -59,7 +59,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
 
         real = qp.solve
         with mock.patch.object(qp, "solve", solve):
-            plan = own(tables, task)
+            plan = plan_of(tables, task)
         recorded: Any = (task.mode, seen["q"], seen["lower"], seen["upper"])
         return plan._replace(memory=recorded)
 
@@ -80,7 +80,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
 def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
     """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
     config = load_config(RunConfig, shipped_config("bound_multiphase.toml"), {})
-    own = planning.build_planner(controller_spec(config))
+    plan_of = planning.build_planner(controller_spec(config))
 
     def planner(tables: Any, task: Any) -> Any:
         seen: list[Any] = []
@@ -95,7 +95,7 @@ def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
             mock.patch.object(qp, "solve_rows", solve),
             mock.patch.object(jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
         ):
-            plan = own(tables, task)
+            plan = plan_of(tables, task)
         return plan._replace(memory=seen[0])
 
     kept = _drive(config, planner, seconds)

@@ -32,10 +32,10 @@ from kjax.sim.observe import find_addresses
 
 BATCHES = (16, 128, 1024)
 MJX_BATCHES = (16, 128, 1024)
-ENGINE_CASES = 64  # walked by both engines
+ENGINE_CASES = 64  # episodes of both engines
 ROUNDS = 5  # of closed loop and bare engine in turn; medians of each, and of their ratios
-WALK = 0.5  # s of walking that is timed in C
-WALK_MJX = 0.25
+EPISODE = 0.5  # s of closed loop that are timed in C
+EPISODE_MJX = 0.25
 
 
 def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
@@ -103,22 +103,22 @@ def cases(gait: str, count: int, seconds: float) -> list[RunConfig]:
 
 def c_batch(gait: str, torques: Any, size: int, rounds: int) -> dict[str, float]:
     """Closed loop, and the bare engine on the torques of that loop, in turn."""
-    seconds = WALK if size >= 1024 else 2.0 * WALK
+    seconds = EPISODE if size >= 1024 else 2.0 * EPISODE
     configs = cases(gait, size, seconds)
     engine = BatchEngine(configs[0], torques=torques)
     recording = engine.run(configs)  # compiles
     bare = bare_batch(engine, configs, recording.torque, torques)
     steps = size * round(seconds / configs[0].sim.sim_dt)
     per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
-    walked = int(recording.ticks.sum()) * per_tick  # fewer steps where a robot fell
+    completed = int(recording.ticks.sum()) * per_tick  # fewer steps where a robot fell
     calls: dict[str, Call] = {
         "closed": lambda _: engine.run(configs).wall_time,
         "bare": lambda _: bare(),
     }
     times = interleaved(calls, rounds, warm_up=0, measure=reported)
-    ratios = times["bare"] / times["closed"] * walked / steps
+    ratios = times["bare"] / times["closed"] * completed / steps
     return {
-        "robot_steps_per_s": walked / float(np.median(times["closed"])),
+        "robot_steps_per_s": completed / float(np.median(times["closed"])),
         "bare_robot_steps_per_s": steps / float(np.median(times["bare"])),
         "over_bare": float(np.median(ratios)),
         "over_bare_min": float(ratios.min()),
@@ -170,13 +170,13 @@ def python_loop(seconds: float) -> dict[str, float]:
 
 def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     """Closed loop on MJX, and ``mjx.step`` in a scan with torques held, in turn."""
-    configs = cases("trot", size, WALK_MJX)
+    configs = cases("trot", size, EPISODE_MJX)
     engine = MjxEngine(configs[0])
     clock = time.perf_counter()
     recording = engine.run(configs)
     first = time.perf_counter() - clock
     model = mjx.put_model(engine.model)
-    steps = round(WALK_MJX / configs[0].sim.sim_dt)
+    steps = round(EPISODE_MJX / configs[0].sim.sim_dt)
     per_tick = round(configs[0].lmpc.control_dt / configs[0].sim.sim_dt)
     order = np.argsort(find_addresses(get_robot(), engine.model).actuator.reshape(-1))
 
@@ -185,7 +185,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
         data = data.replace(qpos=data.qpos.at[:].set(qpos), qvel=data.qvel.at[:].set(qvel))
         return mjx.forward(model, data)
 
-    def walk(data: Any, torque: Any) -> Any:
+    def rollout(data: Any, torque: Any) -> Any:
         def tick(data: Any, row: Any) -> Any:
             def step(data: Any, _: None) -> Any:
                 stepped = mjx.step(model, data.replace(ctrl=row))
@@ -198,7 +198,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     starts = [initial_state(config, engine.model) for config in configs]
     qpos, qvel = (np.stack(a) for a in zip(*starts, strict=True))
     data = jax.jit(jax.vmap(begin))(qpos, qvel)
-    bare = jax.jit(jax.vmap(walk, (0, 1)))
+    bare = jax.jit(jax.vmap(rollout, (0, 1)))
     torque = recording.torque[: len(recording.qpos)][..., order]
     jax.block_until_ready(bare(data, torque))
     calls: dict[str, Call] = {
@@ -302,7 +302,7 @@ def mjx_compile_times() -> dict[str, float]:
 def two_processes(folder: Path) -> dict[str, float]:
     """A sweep on two processes of one thread each beside one, both compiled before.
 
-    The speedup is that of walking: the sum of both rates over the rate of one, without each
+    The speedup is that of the episodes: the sum of both rates over the rate of one, without each
     process's first chunk, which loads the program. ``..._whole`` is that of the whole command, the
     start of which, some 15 s, does not get shorter.
     """
@@ -338,8 +338,8 @@ def two_processes(folder: Path) -> dict[str, float]:
         if any(process.returncode for process in running):
             raise RuntimeError("\n".join(texts))
         rates = [re.findall(r"([0-9.]+) k robot-steps/s", text)[1:] for text in texts]
-        walking = sum(float(np.median([float(r) for r in own])) for own in rates if own)
-        return time.perf_counter() - clock, walking
+        rate = sum(float(np.median([float(r) for r in own])) for own in rates if own)
+        return time.perf_counter() - clock, rate
 
     once(1, "--seeds", "64")
     (alone, one), (together, two) = once(1), once(2)

@@ -52,7 +52,7 @@ def save_page(folder: Path, record: dict[str, Any], args: Namespace, cache: Cach
     rows = _table(record["experiments"])
     notes = list(NOTES)
     if record["quick"]:
-        notes.insert(0, "A quick check of the machinery: these numbers are no result.")
+        notes.insert(0, "A quick check of the machinery: this is no result.")
     text = "\n".join([markdown_table(HEADER, rows), *(f"{note}\n" for note in notes)])
     cli.write_text(folder / "table.md", text)
     title = "Koopman LMPC for a quadruped: the paper's results, reproduced"
@@ -101,7 +101,9 @@ def _held_rows(title: str, base: str, cost: dict[str, Any]) -> list[list[str]]:
         *((label, _number(cost[metric]["median"]), _interval(cost[metric]))
           for metric, label in HELD),
     ]  # fmt: skip
-    return [[name, base, label, "", "", value, ends, "", "", ""] for label, value, ends in shown]
+    return [
+        [name, base, label, "", "", value, interval, "", "", ""] for label, value, interval in shown
+    ]
 
 
 def _interval(row: dict[str, Any], *, percent: bool = False) -> str:

@@ -1,4 +1,4 @@
-"""What is reproduced, as data: experiments, the numbers that the paper publishes, our targets.
+"""What is reproduced, as data: experiments, the figures that the paper publishes, our targets.
 
 To add an experiment, add an ``Experiment``: its config file, what changes between its episodes,
 and one ``Row`` per number to show.
@@ -24,7 +24,7 @@ class Row:
       label: what is shown, with its unit.
       paper: what the paper says of it.
       target: bound to meet: an upper one, for ``crossed`` a lower one.
-      of: which of our numbers the target is for.
+      of: which of our results the target is for.
     """
 
     metric: str

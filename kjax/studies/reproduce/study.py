@@ -1,8 +1,8 @@
-"""Run everything that the paper publishes and set it beside its numbers and our targets.
+"""Run everything that the paper publishes and set it beside its figures and our targets.
 
 Leaves results.json, table.md, index.html and figures/ in the output folder. Every finished episode
 is kept there: the same command goes on after Ctrl-C, and does nothing when all is done. Rough
-ground is walked by the batch engine, on the same fields with torques at every physics step and with
+ground is for the batch engine, on the same fields with torques at every physics step and with
 torques held over a control tick. Both bases take about an hour on two quiet cores;
 kjax/studies/reproduce/paper_results.py says what is run.
 """
@@ -157,9 +157,9 @@ def _measure(
                         if not cache.path(key, ".npz").exists()]  # fmt: skip
             if missing:
                 raise KeyError(missing[0])
-        walk = partial(run_batch, cache, chosen, threads=args.jobs)
-        results = walk(torques="every_step", record=save_series, recorded=SHOWN, label=label)
-        held = walk(torques="held", label=f"{label}, torques held")
+        run_fields = partial(run_batch, cache, chosen, threads=args.jobs)
+        results = run_fields(torques="every_step", record=save_series, recorded=SHOWN, label=label)
+        held = run_fields(torques="held", label=f"{label}, torques held")
         more["held"] = {"summary": summarise(held), "cost": held_cost(results, held)}
         shown = keys["every_step"][:SHOWN]
     else:

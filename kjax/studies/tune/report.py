@@ -35,7 +35,7 @@ def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path
     descent, costs = record["descent"], record["held_out_cost"]
     curve.plot(descent["cost"], lw=0.8, label="training scenarios")
     curve.plot(descent["checks"], descent["held_out"], "o-", ms=2.5, label="held out")
-    curve.axhline(costs["own"], color="k", ls="--", lw=0.8, label="config's own numbers")
+    curve.axhline(costs["own"], color="k", ls="--", lw=0.8, label="config's own parameters")
     curve.set(xlabel="update of Adam", ylabel="cost [-]", yscale="log")
     curve.legend(fontsize=7)
     dt = config.lmpc.control_dt

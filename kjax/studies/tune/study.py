@@ -2,9 +2,9 @@
 
 Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body on legs
 without mass, the controller's own plan, 200 QPs a second), with others held out. With --baseline
-CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time; with --refine it
-goes on from the descent's result. All results, the start and the config's own numbers then walk the
-config's whole command in MuJoCo on other seeds.
+CMA-ES (pycma) tunes the same parameters in MuJoCo itself, for the same wall time; with --refine it
+goes on from the descent's result. All results, the start and the config's own parameters then run
+the config's whole command in MuJoCo on other seeds.
 
 Leaves tuned.toml, metrics.json, table.md and figure.png in the output folder. The state is kept
 there as well: the same command goes on after Ctrl-C or a kill.
@@ -69,7 +69,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     objective = build_objective(short, space, memory=args.memory)
     look = jax.jit(lambda z: jax.vmap(objective, (None, 0))(z, held_out).mean())
     own_cost, begin_cost = float(look(space.start)), float(look(begin))
-    print(f"cost on {args.held_out} held-out scenarios: the config's own numbers {own_cost:.3f}, "
+    print(f"cost on {args.held_out} held-out scenarios: the config's own {own_cost:.3f}, "
           f"the start {begin_cost:.3f}", flush=True)  # fmt: skip
     result = _descend(objective, space, (train, held_out), begin, args, cache.path(key, ".npz"))
     print(f"descent: {len(result.cost)} updates in {result.seconds:.0f} s, held-out cost "
@@ -85,7 +85,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
               f"{searches[name]['population']} in MuJoCo in {searches[name]['seconds']:.0f} s",
               flush=True)  # fmt: skip
     costs = {name: float(look(z)) for name, z in sets.items()}
-    verdict = {name: walk(config, space.overrides(z), args.seeds) for name, z in sets.items()}
+    verdict = {name: verdict_of(config, space.overrides(z), args.seeds) for name, z in sets.items()}
     cli.save_config(folder / "tuned.toml", tuned_config(config, space.overrides(result.best)))
     record = {
         **_record(args, result, searches),
@@ -181,7 +181,7 @@ def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
         type=float,
         default=1.0,
         metavar="FACTOR",
-        help="begin with every number off by this factor, up or down",
+        help="begin with every parameter off by this factor, up or down",
     )
     parser.add_argument("--worsen-seed", type=int, default=0, help="of which are up, which down")
     parser.add_argument(
@@ -198,9 +198,9 @@ def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
     parser.add_argument(
         "--refine",
         action="store_true",
-        help="CMA-ES in MuJoCo from where the descent ends, likewise",
+        help="CMA-ES in MuJoCo from the descent's result, likewise",
     )
-    parser.add_argument("--seeds", type=int, default=16, help="of the walks in MuJoCo at the end")
+    parser.add_argument("--seeds", type=int, default=16, help="episodes in MuJoCo at the end")
     config, args = cli.parse(RunConfig, parser, argv)
     args.speeds = min(config.command.v_x), max(config.command.v_x)
     for name in ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
@@ -261,7 +261,7 @@ def evolve(
     config: RunConfig, space: Space, begin: Variables, args: Namespace, seconds: float,
     cache: Cache, key: str,
 ) -> dict[str, Any]:  # fmt: skip
-    """CMA-ES on batches of MuJoCo walks for some wall time [s]; kept after every generation.
+    """CMA-ES on batches of MuJoCo episodes for some wall time [s]; kept after every generation.
 
     What is kept is the costs and times of the generations: the search draws the same candidates
     from the same seed, and is told again what they cost.
@@ -286,8 +286,8 @@ def evolve(
             search.tell(search.ask(), row.tolist())
             costs.append(row)
             spent.append(float(seconds_of_it))
-    walks = mujoco_scenarios(config, args)
-    engine = BatchEngine(walks[0], torques="held")
+    scenarios = mujoco_scenarios(config, args)
+    engine = BatchEngine(scenarios[0], torques="held")
     with tqdm(total=round(seconds), unit="s", desc="CMA-ES", disable=None) as bar:
         while sum(spent) < seconds and not search.stop():
             clock = time.perf_counter()
@@ -295,11 +295,11 @@ def evolve(
             candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
             recording = engine.run([
                 dataclasses.replace(c, command=w.command, seed=w.seed, sim=w.sim)
-                for c in candidates for w in walks
+                for c in candidates for w in scenarios
             ])  # fmt: skip
             if recording.interrupted:
                 raise KeyboardInterrupt
-            row = recording_costs(recording).reshape(len(asked), len(walks)).mean(axis=1)
+            row = recording_costs(recording).reshape(len(asked), len(scenarios)).mean(axis=1)
             search.tell(asked, row.tolist())
             costs.append(row)
             spent.append(time.perf_counter() - clock)
@@ -310,14 +310,14 @@ def evolve(
         "best": unflat(search.result.xfavorite if costs else mean),
         "generations": len(costs),
         "population": search.popsize,
-        "episodes": len(costs) * search.popsize * len(walks),
+        "episodes": len(costs) * search.popsize * len(scenarios),
         "seconds": sum(spent),
         "cost": [float(one.min()) for one in costs],
     }
 
 
 def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
-    """What a candidate of the baseline walks: the descent's commands, in MuJoCo."""
+    """Episodes of a candidate of the baseline: the descent's commands, in MuJoCo."""
     rng = np.random.default_rng(TRAIN_SEED)
     low, high = args.speeds
     times = tuple(float(i) * args.seconds / args.pieces for i in range(args.pieces))
@@ -334,7 +334,7 @@ def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
     ]
 
 
-def walk(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, Any]:
+def verdict_of(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, Any]:
     """The config's whole command in MuJoCo with some values, torques at every step."""
     chosen = tuned_config(config, overrides)
     configs = [dataclasses.replace(chosen, seed=seed) for seed in range(seeds)]
@@ -356,7 +356,7 @@ def walk(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, 
 def traces(
     config: RunConfig, space: Space, sets: dict[str, Variables], scenarios: loop.Scenario
 ) -> dict[str, Any]:
-    """The first held-out scenario with every set of numbers."""
+    """The first held-out scenario with every set of parameters."""
     run = jax.jit(loop.build_loop(config))
     one = jax.tree.map(lambda a: a[0], scenarios)
     return {name: jax.device_get(run(space.params(z), one)) for name, z in sets.items()}

@@ -10,7 +10,7 @@ from kjax.viz.tables import markdown_table
 LABELS = {
     "nominal": "rigid body, feet planted",
     "affine": "+ affine residual",
-    "clock_history": "+ place in the phase, last force",
+    "clock_history": "+ phase clock, last force",
     "touchdown": "+ ticks around a touchdown",
 }
 
