@@ -1,4 +1,4 @@
-"""All of the paper's figures and numbers beside ours; goes on where it stopped.
+"""All that the paper publishes beside our results; goes on where it stopped.
 
     python experiments/reproduce.py
 

@@ -2,11 +2,11 @@
 
     python experiments/tune.py configs/trot_velocity_long.toml
 
-``--help`` lists the options; the program is ``kjax.studies.tune``.
+``--help`` lists the options; the program is ``kjax.studies.tune.study``.
 """
 
 from kjax import cli
-from kjax.studies.tune import main
+from kjax.studies.tune.study import main
 
 if __name__ == "__main__":
     cli.run(main)

@@ -52,7 +52,7 @@ data.qpos[:], data.qvel[:] = start_state(config, model)
 mujoco.mj_forward(model, data)
 
 
-def walk(tables, seconds):
+def closed_loop(tables, seconds):
     """Speed over time [m/s], sampled every 5 ms."""
     state = controller.init(tables, observe(data.qpos, data.qvel, data.sensordata))
     speed = []
@@ -67,7 +67,7 @@ def walk(tables, seconds):
     return np.array(speed)
 
 
-speed = walk(tables, 3.0)
+speed = closed_loop(tables, 3.0)
 
 # %% [markdown]
 # ## Parameters are data
@@ -78,7 +78,7 @@ speed = walk(tables, 3.0)
 # %%
 command = params.command
 slower = command._replace(values=0.5 * command.values)
-speed = np.concatenate([speed, walk(with_params(tables, command=slower), 3.0)])
+speed = np.concatenate([speed, closed_loop(with_params(tables, command=slower), 3.0)])
 plt.figure(figsize=(7, 3), layout="constrained")
 plt.plot(0.005 * np.arange(len(speed)), speed)
 plt.xlabel("time [s]")

@@ -7,8 +7,8 @@
 # %% [markdown]
 # # Tuning a bound from bad weights, by gradients through the closed loop
 #
-# `kjax.tuning` walks the controller's own `plan` (phase clock, footholds, lift, QP) on a rigid
-# body, 200 QPs per second; the run is a differentiable function of the controller's parameters.
+# `kjax.tuning` closes the loop of the controller's `plan` (phase clock, footholds, lift, QP) and
+# a rigid body, 200 QPs per second; the episode is a differentiable function of the parameters.
 # Here every weight of a bound is off by a factor of ten, up or down, and Adam finds its way back.
 
 # %%
@@ -84,13 +84,13 @@ print(search_space.overrides(result.best))
 # %%
 run = jax.jit(loop.build_loop(config))
 scenario = jax.tree.map(lambda a: a[1], held_out)
-before, after = (
+untuned, tuned = (
     jax.device_get(run(search_space.params(variables), scenario))
     for variables in (bad, result.best)
 )
 print(
     "cost of this scenario:",
-    *(f"{float(loop.cost(get_robot().params, t)):.1f}" for t in (before, after)),
+    *(f"{float(loop.cost(get_robot().params, t)):.1f}" for t in (untuned, tuned)),
 )
 fig, axes = plt.subplots(2, 3, figsize=(11, 5), layout="constrained")
 curve, off = axes[:, 0]
@@ -100,8 +100,8 @@ curve.axhline(own, color="k", ls="--", lw=0.8, label="tuned by hand")
 curve.set(xlabel="update", ylabel="cost", yscale="log")
 curve.legend(fontsize=7)
 off.axis("off")
-t = np.arange(len(before.x)) * config.lmpc.control_dt
-for column, (name, trace) in zip(axes.T[1:], (("before", before), ("after", after)), strict=True):
+t = np.arange(len(untuned.x)) * config.lmpc.control_dt
+for column, (name, trace) in zip(axes.T[1:], (("before", untuned), ("after", tuned)), strict=True):
     alive = np.where(trace.alive, 1.0, np.nan)
     column[0].plot(t, trace.wanted[:, 0], "k--", lw=0.8)
     column[0].plot(t, trace.x[:, 3] * alive, lw=1.0)
@@ -115,5 +115,5 @@ plt.show()
 # %% [markdown]
 # What the rigid body likes need not be what the robot likes: here friction takes what a foot cannot
 # hold, and the foot stays; in MuJoCo it flies away. With `lmpc.friction` as rows of the QP neither
-# happens, and what is tuned here walks there. `experiments/tune.py` ends with the verdict in
+# happens, and what is tuned here works there. `experiments/tune.py` ends with the verdict in
 # MuJoCo, beside CMA-ES in MuJoCo itself for the same time.

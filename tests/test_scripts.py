@@ -1,20 +1,90 @@
-"""The scripts as a user runs them: what they leave, what they say to mistakes, interruption."""
+"""Every script in experiments/: it has help, refuses mistakes in one line, starts as a program.
+
+Two tests start one as a user does; all others, here and in tests/studies and tests/bench, run in
+this process through ``main``.
+"""
 
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
 import time
 import tomllib
+from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
+PLANAR = str(Path(__file__).parents[1] / "configs" / "trot_velocity.toml")
+SCRIPTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.py"))
+# Script -> words that are a mistake, and what is said of them.
+MISTAKES = {
+    "benchmark": (["speed"], "which benchmark? one of: controller, qp,"),
+    "closed_loop": (["configs/trot_velocty.toml"], "did you mean"),
+    "envelope": (["--only", "speed"], "wanted some of speed_trot"),
+    "invariance": (["--residual", "nowhere.npz"], "--residual: no file nowhere.npz"),
+    "koopman_fit": (["--test_stats", "3"], "did you mean --test_states"),
+    "koopman_study": (["--whole-body", "nowhere"], "--whole-body: no results of whole_body.py"),
+    "learn_control": (["--updates", "0"], "--updates: got 0, wanted more than 0"),
+    "model_walks": (["--draw"], "--draw: no metrics.json in"),
+    "raw_steps": (["--threads", "0"], "--threads: got 0, wanted at least 1"),
+    "reproduce": (["--only", "trott"], "--only: got 'trott', wanted some of koopman_fit"),
+    "sweep": (["nowhere.toml"], "nowhere.toml"),
+    "tune": ([PLANAR, "--keys", "lmpc.weights"], "--keys: 'lmpc.weights' is no variable"),
+    "whole_body": (["--robots", "3"], "--robots: got 3, wanted at least 10"),
+}
 
 
 @pytest.fixture(scope="module")
-def script(repository):
+def main_of():
+    """The ``main`` that a script's file has."""
+    return lambda script: runpy.run_path(str(script))["main"]
+
+
+def test_every_script_has_a_mistake_here():
+    assert {script.stem for script in SCRIPTS} == set(MISTAKES)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_a_script_is_thin_and_names_its_command(script):
+    text = script.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 20
+    assert f"\n    python experiments/{script.name}" in text
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_help_ends_well(script, main_of, call, capsys):
+    assert call(main_of(script), "--help") == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("usage: ")
+    assert err == ""
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_a_mistake_is_one_line_and_exit_code_2(script, main_of, call, capsys, tmp_path):
+    words, said = MISTAKES[script.stem]
+    more = [] if script.stem == "benchmark" else ["--out", tmp_path]
+    assert call(main_of(script), *words, *more) == 2
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1, err
+    assert err.startswith("error: ")
+    assert said in err
+    assert out == ""
+
+
+@pytest.mark.parametrize("name", ["closed_loop", "envelope", "koopman_fit", "raw_steps"])
+def test_a_folder_that_cannot_be_written_to_is_one_line(name, repository, main_of, call, capsys):
+    main = main_of(repository / "experiments" / f"{name}.py")
+    assert call(main, "--out", "/dev/null/x") == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "--out /dev/null/x: cannot be written to" in err
+
+
+@pytest.fixture
+def start(repository):
+    """Start a script as a user does."""
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(repository / ".cache" / "jax")}
 
     def start(name, *words):
@@ -35,9 +105,10 @@ def finish(process):
     return process.returncode, out, err
 
 
-def test_a_run_leaves_metrics_config_trajectory_and_figure(script, tmp_path):
+@pytest.mark.slow
+def test_a_run_leaves_metrics_config_trajectory_and_figure(start, tmp_path):
     code, out, err = finish(
-        script("closed_loop.py", "configs/trot_velocity.toml", "--duration", 1, "--out", tmp_path)
+        start("closed_loop.py", "configs/trot_velocity.toml", "--duration", 1, "--out", tmp_path)
     )
     assert code == 0, err
     assert {p.name for p in tmp_path.iterdir()} == {
@@ -54,8 +125,9 @@ def test_a_run_leaves_metrics_config_trajectory_and_figure(script, tmp_path):
     assert str(tmp_path) in out
 
 
-def test_ctrl_c_writes_what_was_simulated(script, tmp_path):
-    process = script("closed_loop.py", "--duration", 2000, "--out", tmp_path)
+@pytest.mark.slow
+def test_ctrl_c_writes_what_was_simulated(start, tmp_path):
+    process = start("closed_loop.py", "--duration", 2000, "--out", tmp_path)
     assert "compiled" in process.stdout.readline()
     time.sleep(2)  # in the loop, far from its end
     process.send_signal(signal.SIGINT)
@@ -66,45 +138,3 @@ def test_ctrl_c_writes_what_was_simulated(script, tmp_path):
     assert metrics["interrupted"] is True
     assert 0.0 < metrics["simulated_s"] < 2000.0
     assert (tmp_path / "figure.png").exists()
-
-
-def test_seeds_go_on_where_they_stopped(script, tmp_path):
-    words = ("closed_loop.py", "--duration", 0.6, "--out", tmp_path, "--seeds")
-    assert finish(script(*words, 1))[0] == 0
-    first = json.loads((tmp_path / "seeds.json").read_text())
-    code, out, err = finish(script(*words, 2))
-    assert code == 0, err
-    both = json.loads((tmp_path / "seeds.json").read_text())
-    assert both["seeds"]["0"] == first["seeds"]["0"]  # wall times included: it was not run again
-    assert set(both["seeds"]) == {"0", "1"}
-    assert both["runs"] == 2
-    assert "2 runs, 0 falls" in out
-
-
-def test_a_mistake_is_one_line_and_exit_code_2(script):
-    for words, part in (
-        (("closed_loop.py", "configs/trot_velocty.toml"), "did you mean"),
-        (("closed_loop.py", "--lmpc.horizon", 0), "greater than 0"),
-        (("closed_loop.py", "--seeds", 0), "at least 1"),
-        (("closed_loop.py", "--out", "/dev/null/x"), "cannot be written"),
-        (("koopman_fit.py", "--test_stats", 3), "did you mean --test_states"),
-        (("benchmark.py", "speed"), "controller"),
-    ):
-        code, _, err = finish(script(*words))
-        assert code == 2, (words, err)
-        assert err.count("\n") == 1, err
-        assert part in err
-
-
-def test_the_fit_study_reports_all_statistics(script, tmp_path):
-    code, out, err = finish(script("koopman_fit.py", "--scales", "[1.0, 0.1]", "--out", tmp_path))
-    assert code == 0, err
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    for mode in ("trot", "front", "rear"):
-        assert set(metrics["error_at_end"][mode]) == {"mean", "variance", "std", "max"}
-        assert metrics["fit"][mode]["rank"] == 19
-        assert metrics["error_at_end"][mode]["variance"]["v_x"] == pytest.approx(
-            metrics["error_at_end"][mode]["std"]["v_x"] ** 2
-        )
-    assert (tmp_path / "figure.png").exists()
-    assert "within 0.0001" in out

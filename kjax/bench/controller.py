@@ -15,6 +15,7 @@ import jax
 import mujoco
 import numpy as np
 
+from kjax.bench.timing import Call, interleaved
 from kjax.config import RunConfig
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.episode import Episode, initial_state
@@ -24,7 +25,7 @@ from kjax.sim.program import requests
 from kjax.sim.resolve import resolve_episode
 
 CALLS = 2000  # timed calls of each function
-WALK = 400  # ms of walking from which the timed inputs are taken
+EPISODE = 400  # physics steps of the closed loop that the timed inputs are taken from
 
 
 def run(config: RunConfig, args: argparse.Namespace) -> dict[str, Any]:
@@ -38,32 +39,24 @@ def run(config: RunConfig, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def controller_latency(config: RunConfig) -> dict[str, Any]:
-    """Latency of the compiled calls on inputs from a walk, and of their floors [ms]."""
+    """Latency of the compiled calls on inputs from a closed loop, and of their floors [ms]."""
     episode = resolve_episode(config)
     simulation = MujocoEngine(episode.spec)
-    states, sensed, data = _walk(simulation, episode)
+    states, sensed, data = _episode(simulation, episode)
     program = simulation.program(episode)
     noop = jax.jit(lambda state, sensed: (state + 1.0, sensed[:12] * 2.0))
-    calls: dict[str, Callable[[Any, Any], Any]] = {
-        "noop": noop,
-        "act": program.act,
-        "plan": program.plan,
+
+    def on_inputs(call: Callable[[Any, Any], Any]) -> Call:
+        return lambda i: np.asarray(call(states[i % len(states)], sensed[i % len(sensed)])[1])
+
+    calls: dict[str, Call] = {
+        "noop": on_inputs(noop),
+        "act": on_inputs(program.act),
+        "plan": on_inputs(program.plan),
+        "physics": lambda _: mujoco.mj_step(simulation.model, data),
     }
-    times: dict[str, list[float]] = {name: [] for name in (*calls, "physics")}
-    for call in calls.values():
-        jax.block_until_ready(call(states[0], sensed[0]))
-    for i in range(CALLS):  # interleaved, so that all see the same machine
-        state, inputs = states[i % len(states)], sensed[i % len(sensed)]
-        for name, call in calls.items():
-            clock = time.perf_counter()
-            _, out = call(state, inputs)
-            np.asarray(out)
-            times[name].append(time.perf_counter() - clock)
-        clock = time.perf_counter()
-        mujoco.mj_step(simulation.model, data)
-        times["physics"].append(time.perf_counter() - clock)
     result: dict[str, Any] = {}
-    for name, values in times.items():
+    for name, values in interleaved(calls, CALLS).items():
         result[f"{name}_ms_median"] = 1e3 * float(np.median(values))
         result[f"{name}_ms_p99"] = 1e3 * float(np.percentile(values, 99))
     result["act_over_noop"] = result["act_ms_median"] / result["noop_ms_median"]
@@ -76,10 +69,10 @@ def controller_latency(config: RunConfig) -> dict[str, Any]:
     return result
 
 
-def _walk(
+def _episode(
     simulation: MujocoEngine, episode: Episode
 ) -> tuple[list[Any], list[np.ndarray], mujoco.MjData]:
-    """Controller states and sensor vectors along a walk, and the data at its end."""
+    """Controller states and sensor vectors along an episode, and the data at its end."""
     model, scene = simulation.model, simulation.spec.scene
     program = simulation.program(episode)
     data = mujoco.MjData(model)
@@ -88,7 +81,7 @@ def _walk(
     states, sensed = [], []
     noise = noise_dim(scene.base) * scene.noise
     state = None
-    for i in range(WALK):
+    for i in range(EPISODE):
         now = np.concatenate([data.qpos, data.qvel, data.sensordata, np.zeros(noise)])
         state = program.init(now, requests(episode)) if state is None else state
         if i % 5 == 0:
@@ -108,14 +101,14 @@ def start_up(config: str | None) -> dict[str, float]:
         command = [sys.executable, "-m", "kjax.studies.closed_loop", *([config] if config else [])]
         seconds = []
         for _ in range(2):
-            clock = time.perf_counter()
+            begin = time.perf_counter()
             subprocess.run(
                 [*command, "--out", str(Path(folder) / "run")],
                 env=environment,
                 check=True,
                 capture_output=True,
             )
-            seconds.append(time.perf_counter() - clock)
+            seconds.append(time.perf_counter() - begin)
         inner = json.loads((Path(folder) / "run" / "metrics.json").read_text(encoding="utf-8"))
     return {
         "first_run_s": seconds[0],

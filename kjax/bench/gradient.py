@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
+from kjax.bench.timing import interleaved, median_ratio
 from kjax.config import RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.tuning import loop
 from kjax.tuning.optimise import build_objective
 from kjax.tuning.space import Space, build_space
+from kjax.viz.tables import markdown_table
 
 _FILES = {
     "trot": "trot_velocity",
@@ -164,44 +166,52 @@ def priced(config: RunConfig, space: Space, count: int, rounds: int) -> dict[str
     def mean(variables: Any, scenarios: Any) -> Any:
         return jax.vmap(objective, (None, 0))(variables, scenarios).mean()
 
-    times, calls, compiled = np.zeros((rounds, 2)), [], []
-    for function in (mean, jax.value_and_grad(mean)):
-        clock = time.perf_counter()
-        calls.append(jax.jit(function).lower(space.start, scenarios).compile())
-        compiled.append(time.perf_counter() - clock)
-        jax.block_until_ready(calls[-1](space.start, scenarios))
-    bytes_each = [call.memory_analysis().temp_size_in_bytes for call in calls]
-    for row in times:
-        for i, call in enumerate(calls):
-            clock = time.perf_counter()
-            jax.block_until_ready(call(space.start, scenarios))
-            row[i] = time.perf_counter() - clock
-    value, both = np.median(times, axis=0)
+    value = jax.jit(mean).lower(space.start, scenarios).compile()
+    begin = time.perf_counter()
+    both = jax.jit(jax.value_and_grad(mean)).lower(space.start, scenarios).compile()
+    compiled = time.perf_counter() - begin
+    times = interleaved(
+        {
+            "value": lambda _: value(space.start, scenarios),
+            "both": lambda _: both(space.start, scenarios),
+        },
+        rounds,
+    )
     return {
-        "value_s": float(value),
-        "value_and_grad_s": float(both),
-        "grad_over_value": float(np.median(times[:, 1] / times[:, 0])),
-        "compile_s": float(compiled[1]),
-        "value_MB": bytes_each[0] / 1e6,
-        "value_and_grad_MB": bytes_each[1] / 1e6,
+        "value_s": float(np.median(times["value"])),
+        "value_and_grad_s": float(np.median(times["both"])),
+        "grad_over_value": median_ratio(times["both"], times["value"]),
+        "compile_s": compiled,
+        "value_MB": _temporary_memory(value),
+        "value_and_grad_MB": _temporary_memory(both),
     }
+
+
+def _temporary_memory(compiled: Any) -> float:
+    """What a compiled program needs besides its arguments and results [MB]."""
+    return float(compiled.memory_analysis().temp_size_in_bytes / 1e6)
 
 
 def table(result: dict[str, Any]) -> str:
     """Markdown."""
-    lines = [
-        "| closed loop, 1 s | parameters x scenarios | error of the gradient, median (90 %)"
-        " | size, median | finite | value [s] | value and gradient [s] | ratio | memory [MB] |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, e in result["cases"].items():
-        lines.append(
-            f"| {name} | {e['compared']} | {e['rel_err_median']:.1e} ({e['rel_err_p90']:.1e}) | "
-            f"{e['grad_norm_median']:.1e} | {e['finite_fraction']:.0%} of {e['scenarios']} | "
-            f"{e['value_s']:.2f} | {e['value_and_grad_s']:.2f} | {e['grad_over_value']:.2f} | "
-            f"{e['value_and_grad_MB']:.0f} |"
+    header = (
+        "closed loop, 1 s", "parameters x scenarios", "error of the gradient, median (90 %)",
+        "size, median", "finite", "value [s]", "value and gradient [s]", "ratio", "memory [MB]",
+    )  # fmt: skip
+    return markdown_table(header, (
+        (
+            name,
+            str(e["compared"]),
+            f"{e['rel_err_median']:.1e} ({e['rel_err_p90']:.1e})",
+            f"{e['grad_norm_median']:.1e}",
+            f"{e['finite_fraction']:.0%} of {e['scenarios']}",
+            f"{e['value_s']:.2f}",
+            f"{e['value_and_grad_s']:.2f}",
+            f"{e['grad_over_value']:.2f}",
+            f"{e['value_and_grad_MB']:.0f}",
         )
-    return "\n".join(lines) + "\n"
+        for name, e in result["cases"].items()
+    ))  # fmt: skip
 
 
 def figure(errors: dict[str, np.ndarray], path: Path) -> None:

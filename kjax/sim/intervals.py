@@ -1,6 +1,6 @@
-"""Intervals that hold with 95 %: of a share, of a median, and of what two shares differ by."""
+"""Intervals that hold with 95 %: of a share, of a median, of what two shares differ by, of more."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -78,3 +78,23 @@ def paired_difference(first: Sequence[bool], second: Sequence[bool]) -> tuple[fl
     low = difference - reach(share_two - low_two, high_one - share_one)
     high = difference + reach(high_two - share_two, share_one - low_one)
     return difference, low, high
+
+
+def bootstrap(
+    statistic: Callable[..., np.ndarray], *samples: Sequence[float] | np.ndarray, draws: int = 2000
+) -> tuple[float, float]:
+    """Ends of a statistic's interval by the percentile bootstrap, with fixed draws.
+
+    Args:
+      statistic: of samples (draws, n) -> (draws,).
+      samples: (n,) each; paired: one draw takes the same rows of all of them.
+      draws: number of resamples.
+    """
+    values = [np.asarray(sample, float) for sample in samples]
+    count = len(values[0])
+    rows = np.random.default_rng(0).integers(0, count, (draws, count))
+    low, high = np.quantile(
+        statistic(*(value[rows] for value in values)),
+        [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL],
+    )
+    return float(low), float(high)

@@ -84,6 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         cli.fail(str(error))
     print(f"models fitted, controller compiled: {time.perf_counter() - clock:.1f} s", flush=True)
+    run: Trajectory | None
     if cache is None:
         run = _simulate_with_bar(simulation, config, view=args.view)
         result = metrics(run, resolve_goal(config))

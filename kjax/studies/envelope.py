@@ -1,6 +1,6 @@
 """How far each gait goes: speed, height of blocks, push, slipperiness of the ground.
 
-A value passes if at least 95 % of the seeds stay up and do what was asked: walk within 20 % of the
+A value passes if at least 95 % of the seeds stay up and do what was asked: keep within 20 % of the
 speed, cross the field. Speed, blocks and friction are bisected; beside a speed that passes stands
 the one that was reached. What a gait bears of a push depends on when it comes, and a harder push
 may pass where a weaker one does not: so pushes are a map over the gait's cycle, and the limit is
@@ -89,7 +89,7 @@ def _friction(value: float, seed: int, config: RunConfig) -> dict[str, Any]:
 
 
 def _steady(speed: float, duration: float) -> dict[str, Any]:
-    """Walk in place for 1 s, then at a speed that is reached at 2 m/s^2."""
+    """In place for 1 s, then at a speed that is reached at 2 m/s^2."""
     return {
         "duration": duration,
         "command.times": [0.0, 1.0],

@@ -32,6 +32,7 @@ from kjax.runs.batches import batch_key, run_batch
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.intervals import median_interval
 from kjax.studies.prediction_models import MODELS, residual
+from kjax.viz.tables import markdown_table
 
 STARTS = (0.0, 10.0, 1e3, 1e4)  # m
 FLOORS = (0.0, -2.0, -0.27, 3.0)  # m
@@ -133,9 +134,9 @@ def _parse(argv: Sequence[str] | None) -> Namespace:
     parser.add_argument("--gaits", nargs="+", choices=tuple(GAITS), default=list(GAITS))
     parser.add_argument("--checks", nargs="+", choices=tuple(LIMITS), default=list(LIMITS))
     parser.add_argument("--residual", type=Path, metavar="FILE", help="a residual of "
-                        "whole_body.py: walk with it in trot as well")  # fmt: skip
+                        "whole_body.py: run it in trot as well")  # fmt: skip
     parser.add_argument("--learned", type=Path, metavar="FILE", help="a model of learn_control.py: "
-                        "walk with it as well")  # fmt: skip
+                        "run it as well")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=16, help="of the bound in float64")
     parser.add_argument("--threads", type=int, default=None, help="one per core by default")
     parser.add_argument("--quick", action="store_true",
@@ -160,12 +161,12 @@ def _namespace(args: Namespace, **more: Any) -> Namespace:
 
 
 def _known(args: Namespace) -> list[str]:
-    """All models that this call could walk with."""
+    """All models that this call could run."""
     return [*ROWS, *(name for name in ("residual", "learned") if getattr(args, name) is not None)]
 
 
 def _parts(args: Namespace) -> Iterator[Part]:
-    """The batches of a call; the checks in turn, so that the first ones are whole early on."""
+    """The batches of a call, check by check, so that the first ones are whole early on."""
     for check in args.checks:
         for model in args.models:
             for gait in args.gaits:
@@ -278,29 +279,28 @@ def _sentence(one: dict[str, Any]) -> str:
 
 def table(found: Sequence[dict[str, Any]], *, quick: bool) -> str:
     """Markdown: one row per check, model and gait."""
-    lines = [
-        "| check | model | gait | episodes | falls | RMSE at (0, 0) [m/s] | largest relative "
-        "difference | at (start [m], floor [m], heading [rad]) | of one seed | limit | met |",
-        "|" + "---|" * 11,
-    ]
+    header = ("check", "model", "gait", "episodes", "falls", "RMSE at (0, 0) [m/s]",
+              "largest relative difference", "at (start [m], floor [m], heading [rad])",
+              "of one seed", "limit", "met")  # fmt: skip
+    rows = []
     for one in found:
         limit = f"{LIMITS[one['check']]:g}"
         if one["interval_mps"] is not None:
             limit = "{:.4f} to {:.4f} m/s".format(*one["interval_mps"])
         place = ", ".join(f"{value:g}" for value in one["largest_at"])
-        lines.append(
-            f"| {one['check']} | {one['model']} | {TITLES[one['gait']]} | "
-            f"{one['seeds'] * len(one['cells'])} | {one['falls']} | {one['rmse_mps']:.4f} | "
-            f"{one['largest']:.1e} | {place} | {one['largest_of_a_seed']:.1e} | {limit} | "
-            f"{'yes' if one['met'] else 'NO'} |"
-        )
-    lines += [
-        "",
+        rows.append(
+            (one["check"], one["model"], TITLES[one["gait"]],
+             str(one["seeds"] * len(one["cells"])), str(one["falls"]), f"{one['rmse_mps']:.4f}",
+             f"{one['largest']:.1e}", place, f"{one['largest_of_a_seed']:.1e}", limit,
+             "yes" if one["met"] else "NO")
+        )  # fmt: skip
+    lines = [
+        markdown_table(header, rows),
         "Medians over the seeds. The limit in the bound is the 95 % interval of the median at "
         "(0, 0). Falls must be the same in every cell as well.",
     ]
     if quick:
-        lines.append("\nA quick check of the machinery: these numbers are no result.")
+        lines.append("\nA quick check of the machinery: this is no result.")
     return "\n".join(lines) + "\n"
 
 

@@ -28,6 +28,7 @@ from kjax.koopman.dataset import SampleRanges, sample
 from kjax.prediction import evaluation, families, learned
 from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
+from kjax.viz.tables import markdown_table
 
 DT = 1e-3  # s
 MODES = {"trot": Mode.TROT, "front": Mode.FRONT, "rear": Mode.REAR}
@@ -41,7 +42,8 @@ RANGES = {
     "trot ranges": ((0.5, 0.1, 0.15, 0.5, 0.5, 1.0), (15.0, 20.0)),
     "bound ranges": ((0.5, 0.1, 0.4, 1.0, 1.0, 3.0), (40.0, 62.0)),
 }
-Fitted = dict[str, tuple[families.Family, Any, srb_planar.Plant, bool]]
+# Family, parameters, plant that it is judged on, whether linearised at the start.
+Fitted = tuple[families.Family, Any, srb_planar.Plant, bool]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -111,8 +113,7 @@ def study(args: argparse.Namespace) -> dict[str, Any]:
                 jax.random.fold_in(key, 1), rollouts=profiles, steps=round(HORIZONS[-1] / DT)
             ).inputs
             out["errors"][name][gait] = {
-                label: judge(family, params, plant, here, alpha, starts, forces, frozen)
-                for label, (family, params, plant, frozen) in models.items()
+                label: judge(model, here, alpha, starts, forces) for label, model in models.items()
             }
     return out
 
@@ -134,13 +135,13 @@ def ranges_of(
 
 def fit_all(
     args: argparse.Namespace, body: srb_planar.SrbParams, alpha: Any, ranges: SampleRanges
-) -> Fitted:
-    """Every model of a contact mode: family, parameters, plant it is judged on, frozen or not."""
+) -> dict[str, Fitted]:
+    """Every model of a contact mode."""
     data = sample(
         jax.random.key(args.seed), body, alpha, ranges, rollouts=ROLLOUTS, steps=STEPS, dt=DT
     )
     known = families.BodyModel(body, alpha)
-    out: Fitted = {
+    out: dict[str, Fitted] = {
         "SRB linearised at hover": (
             families.linear(observables.states_only(), DT),
             families.linearised_srb(body, alpha, 0.27, DT), "body", False,
@@ -185,16 +186,10 @@ def fit_all(
 
 
 def judge(
-    family: families.Family,
-    params: Any,
-    plant: srb_planar.Plant,
-    body: srb_planar.SrbParams,
-    alpha: Any,
-    starts: Any,
-    forces: Any,
-    frozen: bool,
+    model: Fitted, body: srb_planar.SrbParams, alpha: Any, starts: Any, forces: Any
 ) -> dict[str, Any]:
     """Statistics of the error at the horizons, each with its bootstrap interval over the starts."""
+    family, params, plant, frozen = model
     at = np.round(np.array(HORIZONS) / DT).astype(int) - 1
 
     @jax.jit
@@ -259,16 +254,13 @@ def compact(result: dict[str, Any]) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """Largest velocity error after 50 ms and rms after 0.5 s, as Markdown."""
-    lines = []
+    tables = []
     fifty, last = HORIZONS.index(0.05), -1
     for name, modes in result["errors"].items():
-        heads = " | ".join(f"{gait}, 50 ms | {gait}, 0.5 s" for gait in modes)
-        lines += [
-            f"| {name}: error of the velocity [m/s] | observables | {heads} |",
-            "|---|---" + "|---|---" * len(modes) + "|",
-        ]
+        heads = [f"{gait}, {when}" for gait in modes for when in ("50 ms", "0.5 s")]
+        rows = []
         for label, entry in next(iter(modes.values())).items():
-            cells = []
+            cells = [label, str(entry["observables"])]
             for mode in modes.values():
                 here = mode[label]
                 cells.append(f"{here['max_velocity'][fifty]:.1e}")
@@ -276,10 +268,11 @@ def table(result: dict[str, Any]) -> str:
                     np.linalg.norm(here[k][last][VELOCITY]) for k in ("rms", "rms_low", "rms_high")
                 )
                 cells.append(f"{rms:.1e} ({low:.1e} to {high:.1e})")
-            lines.append(f"| {label} | {entry['observables']} | " + " | ".join(cells) + " |")
-        lines.append("")
-    lines.append("50 ms: largest error of the test; 0.5 s: rms and its 95 % interval over starts.")
-    return "\n".join(lines) + "\n"
+            rows.append(cells)
+        header = [f"{name}: error of the velocity [m/s]", "observables", *heads]
+        tables.append(markdown_table(header, rows))
+    note = "50 ms: largest error of the test; 0.5 s: rms and its 95 % interval over starts.\n"
+    return "\n".join([*tables, note])
 
 
 # Drawn alike: (beginning of the label, colour); the more specific first.

@@ -2,7 +2,7 @@
 
 One network, one start, one set of data, trained twice: on many-step prediction alone, and with the
 cost of closed loops on the rigid body added, differentiated through every QP. Both then predict
-held-out rollouts, walk held-out scenarios on the rigid body, and walk in MuJoCo. Leaves
+held-out rollouts, and run held-out scenarios on the rigid body and in MuJoCo. Leaves
 metrics.json, table.md, figure.png and both models (for koopman.file) in the output folder.
 """
 
@@ -30,10 +30,12 @@ from kjax.prediction import families, learned, storage
 from kjax.robots import get_robot
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.intervals import bootstrap
 from kjax.sim.resolve import batch_spec, resolve_episode
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.types import MODE_ALPHA, Mode
+from kjax.viz.tables import markdown_table
 
 DT, STEPS, ROLLOUTS = 1e-3, 100, 100
 TRAIN_SEED, HELD_OUT_SEED, HELD_OUT = 100, 200, 32
@@ -73,17 +75,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             "held_out_cost_each": each,
             "diverged": bool(training.diverged),
             "loss": np.asarray(training.loss)[:: max(1, args.updates // 200)],
-            "mujoco": walk(args, file),
+            "mujoco": verdict_of(args, file),
         }
         print(f"{name}: velocity 50 ms ahead {result[name]['velocity_error_50ms_rms']:.3g} m/s, "
               f"held-out cost {result[name]['held_out_cost']:.3f}", flush=True)  # fmt: skip
-    result["own_linear_model"] = {"mujoco": walk(args, None)}
-    rng = np.random.default_rng(0)
-    rows = rng.integers(0, HELD_OUT, (2000, HELD_OUT))
+    result["own_linear_model"] = {"mujoco": verdict_of(args, None)}
     first, second = (np.asarray(result[n]["held_out_cost_each"]) for n in models)
-    ratio = second[rows].mean(axis=1) / first[rows].mean(axis=1)
     result["cost_ratio"] = float(second.mean() / first.mean())
-    result["cost_ratio_low"], result["cost_ratio_high"] = np.quantile(ratio, [0.025, 0.975])
+    result["cost_ratio_low"], result["cost_ratio_high"] = bootstrap(
+        lambda a, b: b.mean(axis=1) / a.mean(axis=1), first, second
+    )
     cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
     (folder / "table.md").write_text(table(result), encoding="utf-8")
     figure(result, folder / "figure.png")
@@ -100,7 +101,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--rate",
         type=float,
         default=3e-3,
-        help="of Adam, in what each number moves by itself",
+        help="of Adam, in what each parameter moves by itself",
     )
     parser.add_argument("--scenarios", type=int, default=4, help="closed loops per update")
     parser.add_argument("--seconds", type=float, default=0.6, help="length of each")
@@ -139,7 +140,7 @@ def draw(seed: int, rollouts: int) -> Any:
 
 
 def train(args: argparse.Namespace, data: Any, extra: Any) -> tuple[Any, learned.Training]:
-    """A model and how its training went; the same random numbers with and without ``extra``."""
+    """A model and how its training went; the same random draws with and without ``extra``."""
     fit = partial(
         learned.train,
         head=args.head,
@@ -159,8 +160,8 @@ def stacked(model: Any) -> Any:
 def save(path: Path, model: Any) -> None:
     """Write a model for koopman.file."""
     spread = np.zeros((len(Mode), 6))
-    numbers = jax.device_get(stacked(model))
-    storage.save(path, storage.Stored("learned", DT, numbers, spread))
+    params = jax.device_get(stacked(model))
+    storage.save(path, storage.Stored("learned", DT, params, spread))
 
 
 def costs_of(params: Any, run: loop.Loop) -> Any:
@@ -186,7 +187,7 @@ def prediction_errors(model: Any, data: Any) -> jax.Array:
     return jax.vmap(one)(*data)
 
 
-def walk(args: argparse.Namespace, path: Path | None) -> dict[str, Any]:
+def verdict_of(args: argparse.Namespace, path: Path | None) -> dict[str, Any]:
     """The config's command in MuJoCo."""
     config = run_config(path)
     engine = BatchEngine(batch_spec(config))
@@ -205,29 +206,25 @@ def walk(args: argparse.Namespace, path: Path | None) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """Markdown."""
-    lines = [
-        "| trained for | velocity error, 50 ms, rms [m/s] | held-out cost | MuJoCo: fell | "
-        "RMSE of v_x [m/s] | cost |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name in ("prediction", "prediction and control", "own_linear_model"):
         entry = result[name]
-        walked = entry["mujoco"]
-        rmse = walked.get("velocity_rmse_mps")
-        ahead = (
-            f"{entry['velocity_error_50ms_rms']:.3g} | {entry['held_out_cost']:.3f}"
-            if "held_out_cost" in entry else "- | -"
+        verdict = entry["mujoco"]
+        rmse = verdict.get("velocity_rmse_mps")
+        ahead = ("-", "-")
+        if "held_out_cost" in entry:
+            ahead = (f"{entry['velocity_error_50ms_rms']:.3g}", f"{entry['held_out_cost']:.3f}")
+        rows.append(
+            (name.replace("_", " "), *ahead, f"{verdict['falls']} of {verdict['runs']}",
+             f"{rmse['median']:.4f} ({rmse['worst']:.4f})" if rmse else "-",
+             f"{verdict['cost_median']:.3f}")
         )  # fmt: skip
-        lines.append(
-            f"| {name.replace('_', ' ')} | {ahead} | {walked['falls']} of {walked['runs']} | "
-            + (f"{rmse['median']:.4f} ({rmse['worst']:.4f})" if rmse else "-")
-            + f" | {walked['cost_median']:.3f} |"
-        )
-    lines.append(
+    header = ("trained for", "velocity error, 50 ms, rms [m/s]", "held-out cost", "MuJoCo: fell",
+              "RMSE of v_x [m/s]", "cost")  # fmt: skip
+    return markdown_table(header, rows) + (
         f"\nHeld-out cost with control over without: {result['cost_ratio']:.3f} "
-        f"({result['cost_ratio_low']:.3f} to {result['cost_ratio_high']:.3f})"
+        f"({result['cost_ratio_low']:.3f} to {result['cost_ratio_high']:.3f})\n"
     )
-    return "\n".join(lines) + "\n"
 
 
 def figure(result: dict[str, Any], path: Path) -> None:

@@ -1,15 +1,16 @@
-"""Does a better prediction walk better? Every prediction model in closed loop, weights tuned alike.
+"""Is a better prediction better in closed loop? Every model, its weights tuned alike.
 
 For each gait and model the same number of random weight sets is tried on tuning seeds, and the best
 one reports on other seeds, beside the config's own weights. Leaves metrics.json, table.md and
-figure.png in the output folder. Every model is kept as it ends: the same command goes on. A folder
-of other code, or of a model that would walk other episodes now, is refused.
+figure.png in the output folder. Every finished model is kept: the same command goes on. One
+of other code, or whose episodes would be others now, is run again.
 """
 
 import dataclasses
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,9 @@ from kjax import cli
 from kjax.config import Gaits, RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.runs.cache import Cache, open_cache
+from kjax.sim.intervals import bootstrap
 from kjax.studies.prediction_models import MODELS, residual
+from kjax.viz.tables import markdown_table
 
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
 SPEEDS = {"trot": (0.0, 0.3, 0.6), "bound": (0.0, 0.5, 0.8)}  # m/s, one after the other
@@ -34,21 +37,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = cli.script_parser(__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="two models, few sets and seeds")
     parser.add_argument("--residual", type=Path, metavar="DIR", help="results of whole_body.py: "
-                        "walk with its residuals as well")  # fmt: skip
+                        "run its residuals as well")  # fmt: skip
     parser.add_argument("--gaits", nargs="+", choices=GAITS, default=list(GAITS))
-    parser.add_argument("--draw", action="store_true", help="draw finished walks again")
+    parser.add_argument("--draw", action="store_true", help="draw finished models again")
     args = parser.parse_args(argv)
     folder = cli.output_folder(args, "model_walks")
     if args.draw:
         file = folder / "metrics.json"
         if not file.exists():
             cli.fail(f"--draw: no metrics.json in {folder}")
-        walks = json.loads(file.read_text(encoding="utf-8"))["walks"]
-        figure(walks, folder / "figure.png")
+        found = json.loads(file.read_text(encoding="utf-8"))["walks"]
+        figure(found, folder / "figure.png")
         return 0
     cli.configure_jax()
     cache = open_cache(folder, Path(__file__))
-    clock, walks = time.perf_counter(), {}
+    clock, found = time.perf_counter(), {}
     studies = {
         f"{gait}, {name}" + (", quick" if args.quick else ""): Study(gait, name, keys, args.quick)
         for gait in args.gaits
@@ -58,26 +61,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         key = identity(cache, study)
         if key not in cache:
             try:
-                cache.add({key: walk(study)})
+                cache.add({key: tuned_and_reported(study)})
             except KeyboardInterrupt:
                 print(f"interrupted; finished models are kept in {folder}/, run again to go on")
                 return 130
-        walks[label] = {"gait": study.gait, "model": study.name, **cache[key]}
-        tuned = walks[label]["tuned"]
+        found[label] = {"gait": study.gait, "model": study.name, **cache[key]}
+        tuned = found[label]["tuned"]
         print(f"{label}: rmse {tuned['rmse_median']:.4f} m/s, {tuned['falls']} of "
-              f"{tuned['episodes']} fell, tuned on {walks[label]['sets']} sets "
+              f"{tuned['episodes']} fell, tuned on {found[label]['sets']} sets "
               f"({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
-    text = table(walks)
+    text = table(found)
     (folder / "table.md").write_text(text, encoding="utf-8")
-    figure(walks, folder / "figure.png")
-    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), "walks": walks})
+    figure(found, folder / "figure.png")
+    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), "walks": found})
     print(text)
     print(f"results in {folder}/")
     return 0
 
 
 def models_of(gait: str, args: Any) -> dict[str, dict[str, Any]]:
-    """Config keys of the models to walk with."""
+    """Config keys of the models to run."""
     names = ("linear (the paper)", "SRB re-linearised") if args.quick else MODELS
     models = {name: MODELS[name] for name in names}
     if args.residual is not None and gait == "trot":  # its step of 5 ms is no bound's
@@ -118,12 +121,12 @@ def candidates(study: Study) -> list[RunConfig]:
 
 
 def identity(cache: Cache, study: Study) -> str:
-    """Key of all that decides which episodes are walked, the content of model files included."""
+    """Key of all that decides which episodes are run, the content of model files included."""
     _, tune, report = study.sizes
     return cache.key(*candidates(study), tune, report)
 
 
-def walk(study: Study) -> dict[str, Any]:
+def tuned_and_reported(study: Study) -> dict[str, Any]:
     """Tune the weights of a model, then report them and the config's own on other seeds."""
     sets, tune, report = study.sizes
     scales, chosen = weight_scales(sets), candidates(study)
@@ -165,7 +168,7 @@ def scaled(config: RunConfig, row: np.ndarray) -> RunConfig:
 
 
 def config_of(gait: str, keys: dict[str, Any]) -> RunConfig:
-    """Flat ground, three speeds in turn, feet-only contacts."""
+    """Flat ground, three speeds one after the other, feet-only contacts."""
     speeds = SPEEDS[gait]
     own = {
         "duration": 2.0 + 2.0 * len(speeds),
@@ -199,28 +202,25 @@ def statistics(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Falls; medians of those that stayed up, with the interval of the median (95 %, bootstrap)."""
     up = [row for row in rows if not row["fell"]]
     out: dict[str, Any] = {"episodes": len(rows), "falls": len(rows) - len(up)}
-    rng = np.random.default_rng(0)
     for name, key in (("rmse", "velocity_rmse_mps"), ("pitch", "pitch_p95_deg")):
         values = np.array([row[key] for row in up]) if up else np.array([np.nan])
-        draws = np.median(rng.choice(values, (2000, len(values))), axis=1)
         out[f"{name}_median"] = float(np.median(values))
-        out[f"{name}_low"], out[f"{name}_high"] = map(float, np.quantile(draws, [0.025, 0.975]))
+        out[f"{name}_low"], out[f"{name}_high"] = bootstrap(partial(np.median, axis=1), values)
     return out
 
 
-def table(walks: dict[str, Any]) -> str:
+def table(found: dict[str, Any]) -> str:
     """Markdown."""
-    lines = [
-        "| gait, model | rmse of v_x, tuned [m/s] | fell | pitch, 95 % [deg] | not tuned | fell |",
-        "|---|---|---|---|---|---|",
-    ]
-    for label, entry in walks.items():
+    rows = []
+    for label, entry in found.items():
         tuned, own = entry["tuned"], entry["own_weights"]
-        lines.append(
-            f"| {label} | {_interval(tuned, 'rmse')} | {tuned['falls']} of {tuned['episodes']} | "
-            f"{_interval(tuned, 'pitch')} | {_interval(own, 'rmse')} | {own['falls']} |"
-        )
-    return "\n".join(lines) + "\n"
+        rows.append(
+            (label, _interval(tuned, "rmse"), f"{tuned['falls']} of {tuned['episodes']}",
+             _interval(tuned, "pitch"), _interval(own, "rmse"), str(own["falls"]))
+        )  # fmt: skip
+    header = ("gait, model", "rmse of v_x, tuned [m/s]", "fell", "pitch, 95 % [deg]", "not tuned",
+              "fell")  # fmt: skip
+    return markdown_table(header, rows)
 
 
 def _interval(entry: dict[str, Any], name: str) -> str:
@@ -229,16 +229,16 @@ def _interval(entry: dict[str, Any], name: str) -> str:
     return "none stayed up" if np.isnan(value) else f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
-def figure(walks: dict[str, Any], path: Path) -> None:
+def figure(found: dict[str, Any], path: Path) -> None:
     """Error of the speed and pitch of each model, tuned and with the config's own weights."""
-    gaits = list(dict.fromkeys(entry["gait"] for entry in walks.values()))
+    gaits = list(dict.fromkeys(entry["gait"] for entry in found.values()))
     panels = (("rmse", "rmse of v_x [m/s]"), ("pitch", "pitch, 95 % [deg]"))
     fig, axes = plt.subplots(
         len(gaits), 2, figsize=(9.5, 0.8 + 3.4 * len(gaits)), sharey="row", layout="constrained",
         squeeze=False,
     )  # fmt: skip
     for row, gait in zip(axes, gaits, strict=True):
-        own = [entry for entry in walks.values() if entry["gait"] == gait]
+        own = [entry for entry in found.values() if entry["gait"] == gait]
         for ax, (name, label) in zip(row, panels, strict=True):
             seen = []
             for shift, key, legend in (
@@ -250,8 +250,8 @@ def figure(walks: dict[str, Any], path: Path) -> None:
                     for part in ("median", "low", "high")
                 )
                 # Medians of a few that stayed up would press all others together.
-                walked = np.array([2 * e[key]["falls"] < e[key]["episodes"] for e in own])
-                value[~walked] = np.nan
+                upright = np.array([2 * e[key]["falls"] < e[key]["episodes"] for e in own])
+                value[~upright] = np.nan
                 seen.append(value)
                 at = np.arange(len(own)) + shift
                 ax.errorbar(value, at, xerr=[value - low, high - value], fmt="o", ms=4,

@@ -35,6 +35,7 @@ from kjax.sim.intervals import median_interval, wilson
 from kjax.sim.observe import find_addresses
 from kjax.sim.resolve import build_scene
 from kjax.sim.trajectory import Trajectory
+from kjax.viz.tables import markdown_table
 
 GAITS = {"trot": "trot_velocity.toml", "trot_long": "trot_velocity_long.toml"}
 TITLES = {"trot": "trot, 6 x 1 ms", "trot_long": "trot, 10 x 20 ms"}
@@ -59,7 +60,7 @@ PITCH = {SMALL: 5.0, LARGE: 8.0}  # deg
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class Setting:
     """A gait on a base with one kind of force limits.
 
     Attributes:
@@ -90,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.configure_jax()
     cache = open_cache(folder, Path(__file__))
     chosen = [
-        Case(gait=gait, base=base, forces=forces)
+        Setting(gait=gait, base=base, forces=forces)
         for forces in args.forces for gait in args.gaits for base in args.bases
     ]  # fmt: skip
     try:
@@ -138,7 +139,9 @@ def _parse(argv: Sequence[str] | None) -> Namespace:
     return args
 
 
-def steps_of(case: Case, start: float, args: Namespace) -> Iterator[tuple[float, list[RunConfig]]]:
+def steps_of(
+    case: Setting, start: float, args: Namespace
+) -> Iterator[tuple[float, list[RunConfig]]]:
     """Velocities after a step from ``start``, and the configs of all seeds."""
     earliest, values = STEPS[start]
     if args.quick:
@@ -184,7 +187,7 @@ def _scene(name: str, base: str, contacts: str) -> tuple[Any, Any]:
     return model, find_addresses(get_robot(name), model)
 
 
-def measured(case: Case, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
+def measured(case: Setting, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
     """Falls, body contacts and pitch of each step of a finished case."""
     rows = []
     for start in STEPS:
@@ -217,7 +220,7 @@ def measured(case: Case, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
     return rows
 
 
-def _sentence(case: Case, rows: Sequence[dict[str, Any]]) -> str:
+def _sentence(case: Setting, rows: Sequence[dict[str, Any]]) -> str:
     falls, touches, over, count = (
         sum(row[key] for row in rows)
         for key in ("falls", "body_contacts", "pitch_over", "episodes")
@@ -235,7 +238,7 @@ def _finished(cache: Cache, args: Namespace) -> Iterator[dict[str, Any]]:
     for forces in FORCES:
         for gait in GAITS:
             for base in BASES:
-                case = Case(gait=gait, base=base, forces=forces)
+                case = Setting(gait=gait, base=base, forces=forces)
                 keys = [
                     batch_key(cache, config, "every_step", measure=after_step)
                     for start in STEPS for _, row in steps_of(case, start, args) for config in row
@@ -246,11 +249,10 @@ def _finished(cache: Cache, args: Namespace) -> Iterator[dict[str, Any]]:
 
 def table(found: Sequence[dict[str, Any]], *, quick: bool) -> str:
     """Markdown: all steps of a case in one row, then every step."""
-    lines = [
-        "| gait | base | forces | steps of | episodes | falls | body contacts | pitch over "
-        "| share over, 95 % interval [%] | largest pitch [deg] | met |",
-        "|" + "---|" * 11,
-    ]
+    header = ("gait", "base", "forces", "steps of", "episodes", "falls", "body contacts",
+              "pitch over", "share over, 95 % interval [%]", "largest pitch [deg]",
+              "met")  # fmt: skip
+    cases = []
     for forces, gait, base, (limit, inside) in (
         (f, g, b, s) for f in FORCES for g in GAITS for b in BASES for s in _sizes().items()
     ):
@@ -266,37 +268,40 @@ def table(found: Sequence[dict[str, Any]], *, quick: bool) -> str:
             for key in ("episodes", "falls", "body_contacts", "pitch_over")
         )
         low, high = wilson(over, count)
-        lines.append(
-            f"| {TITLES[gait]} | {base} | {forces} | {limit} | {count} | {falls} | {touches} | "
-            f"{over} | {100 * low:.1f} to {100 * high:.1f} | "
-            f"{max(row['pitch_max_deg'] for row in rows):.1f} | "
-            f"{'yes' if all(row['met'] for row in rows) else 'NO'} |"
-        )
-    lines += [
-        "",
-        "| gait | base | forces | from [m/s] | to [m/s] | falls | body contacts | pitch: median "
-        "[deg] | 95 % interval | largest | of seed | limit | met |",
-        "|" + "---|" * 13,
-    ]
-    for row in found:
-        ends = row["pitch_median_interval_deg"]
-        lines.append(
-            f"| {TITLES[row['gait']]} | {row['base']} | {row['forces']} | {row['from_mps']:g} | "
-            f"{row['to_mps']:g} | {row['falls']} | {row['body_contacts']} | "
-            f"{row['pitch_median_deg']:.2f} | "
-            f"{'' if ends is None else f'{ends[0]:.2f} to {ends[1]:.2f}'} | "
-            f"{row['pitch_max_deg']:.2f} | {row['worst_seed']} | < {row['pitch_limit_deg']:g} | "
-            f"{'yes' if row['met'] else 'NO'} |"
-        )
-    lines += [
-        "",
+        cases.append(
+            (TITLES[gait], base, forces, limit, *map(str, (count, falls, touches, over)),
+             f"{100 * low:.1f} to {100 * high:.1f}",
+             f"{max(row['pitch_max_deg'] for row in rows):.1f}",
+             "yes" if all(row["met"] for row in rows) else "NO")
+        )  # fmt: skip
+    lines = [
+        markdown_table(header, cases),
+        _steps_table(found),
         "Rows: friction 0.6 and torques 0.95, mean force as the reference of R. Box: the paper's "
         "bounds alone, no reference. Pitch is the largest from the step on; body contact, anything "
         "but a foot that touches the ground at a control tick, is counted over whole episodes.",
     ]
     if quick:
-        lines.append("\nA quick check of the machinery: these numbers are no result.")
+        lines.append("\nA quick check of the machinery: this is no result.")
     return "\n".join(lines) + "\n"
+
+
+def _steps_table(found: Sequence[dict[str, Any]]) -> str:
+    header = ("gait", "base", "forces", "from [m/s]", "to [m/s]", "falls", "body contacts",
+              "pitch: median [deg]", "95 % interval", "largest", "of seed", "limit",
+              "met")  # fmt: skip
+    rows = []
+    for row in found:
+        interval = row["pitch_median_interval_deg"]
+        rows.append(
+            (TITLES[row["gait"]], row["base"], row["forces"], f"{row['from_mps']:g}",
+             f"{row['to_mps']:g}", str(row["falls"]), str(row["body_contacts"]),
+             f"{row['pitch_median_deg']:.2f}",
+             "" if interval is None else "{:.2f} to {:.2f}".format(*interval),
+             f"{row['pitch_max_deg']:.2f}", str(row["worst_seed"]),
+             f"< {row['pitch_limit_deg']:g}", "yes" if row["met"] else "NO")
+        )  # fmt: skip
+    return markdown_table(header, rows)
 
 
 def _sizes() -> dict[str, Callable[[float], bool]]:

@@ -1,4 +1,4 @@
-"""Walk a whole sweep of closed loops: a grid or a random sample of configs, times seeds.
+"""Run a whole sweep of closed loops: a grid or a random sample of configs, times seeds.
 
 Leaves sweep.nc (labelled, xarray), summary.json and figure.png of what its [figure] asks for, and
 in cache/ a file per chunk, in the output folder. Run again, it goes on where it stopped;
@@ -126,22 +126,22 @@ def draw(sweep: SweepConfig, folder: Path, config: str) -> None:
 
 
 # What decides which cases a sweep has, but for the number of their seeds.
-WALKED = ("base", "set", "sample", "sample_seed")
+CASES = ("base", "set", "sample", "sample_seed")
 VALUES = ("values", "low", "high", "count")
 
 
 def require_sweep(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
     """End the program where the folder holds another sweep; figure, units and labels may differ."""
 
-    def walked(spec: dict[str, Any]) -> Any:
+    def cases_of(spec: dict[str, Any]) -> Any:
         axes = {name: [axis[key] for key in VALUES] for name, axis in spec["axes"].items()}
-        return json.loads(json.dumps([axes, *(spec[key] for key in WALKED)]))
+        return json.loads(json.dumps([axes, *(spec[key] for key in CASES)]))
 
     try:
-        held = walked(json.loads(dataset.attrs["sweep"]))
+        held = cases_of(json.loads(dataset.attrs["sweep"]))
     except (KeyError, TypeError, ValueError):
         cli.fail(f"--draw: {folder / 'sweep.nc'} does not say which sweep it is of")
-    if held != walked(to_dict(sweep)):
+    if held != cases_of(to_dict(sweep)):
         cli.fail(
             f"--draw: {folder / 'sweep.nc'} holds another sweep: its base, axes or keys differ"
         )

@@ -71,6 +71,18 @@ def test_an_interrupted_seed_is_not_kept(engine, call, capsys, tmp_path):
     assert "2 runs, 0 falls" in capsys.readouterr().out
 
 
+def test_seeds_go_on_where_they_stopped(engine, call, capsys, tmp_path):
+    words = ("--duration", 2.0, "--out", tmp_path, "--seeds")
+    assert call(closed_loop.main, *words, 1) == 0
+    first = json.loads((tmp_path / "seeds.json").read_text())
+    assert call(closed_loop.main, *words, 2) == 0
+    both = json.loads((tmp_path / "seeds.json").read_text())
+    assert both["seeds"]["0"] == first["seeds"]["0"]
+    assert set(both["seeds"]) == {"0", "1"}
+    assert both["runs"] == engine.episodes == 2
+    assert "2 runs, 0 falls" in capsys.readouterr().out
+
+
 def test_seeds_of_another_config_walk_anew_and_finished_ones_stay(engine, call, capsys, tmp_path):
     def seeds():
         return json.loads((tmp_path / "seeds.json").read_text())
@@ -108,9 +120,14 @@ def test_a_view_without_a_display_is_refused_before_anything_is_compiled(
         (("--view", "--seeds", 2), "--view: shows a single run"),
         (("--restart",), "--restart: belongs to --seeds"),
         (("--duration", 0.001), "duration is 0.001 s, shorter than lmpc.control_dt"),
+        (("--seeds", 0), "--seeds: got 0, wanted at least 1"),
+        (("--lmpc.horizon", 0), "greater than 0"),
+        (("--out", "/dev/null/x"), "cannot be written"),
     ],
 )
-def test_options_that_contradict_each_other_are_one_line(engine, call, capsys, words, said):
+def test_options_that_cannot_be_or_contradict_each_other_are_one_line(
+    engine, call, capsys, words, said
+):
     assert call(closed_loop.main, *words) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1

@@ -1,32 +1,25 @@
-"""Reproduction and envelope as a user runs them, and the rules of their tables."""
+"""The reproduction: the rules of its table; what its script leaves and finds again."""
 
-import dataclasses
 import json
-from argparse import Namespace
+from types import SimpleNamespace
 
 import pytest
 
 from kjax.gait import Gait, phases
 from kjax.runs.cache import Cache
+from kjax.sim.episode import metrics
 from kjax.sim.resolve import batch_spec
-from kjax.studies import envelope
-from kjax.studies.reproduce import paper_results
+from kjax.studies.reproduce import page, paper_results
 from kjax.studies.reproduce import study as reproduce
 
 
-def test_every_experiment_and_axis_has_a_config_that_loads():
+def test_every_experiment_has_a_config_that_loads():
     for experiment in paper_results.EXPERIMENTS:
         config = paper_results.base_config(experiment, "planar", quick=False)
         chosen = paper_results.episodes(experiment, config, seeds=4, terrains=3)
         assert len(chosen) == (3 if experiment.vary == "terrain" else 4)
         assert len(set(chosen)) == len(chosen)
         assert len({one.seed for one in chosen}) == len(chosen)
-    for axis in envelope.AXES:
-        config = envelope._config(axis, "planar", Namespace(quick=False))
-        easy = envelope._changed(config, axis.vary(axis.easy, 3, config), 3)
-        hard = envelope._changed(config, axis.vary(axis.hard, 3, config), 3)
-        assert easy.seed == 3
-        assert easy != hard
 
 
 def test_request_times_cover_a_cycle_of_the_gait_that_is_left():
@@ -88,8 +81,8 @@ def test_the_cost_of_held_torques_is_counted_field_by_field():
     assert rmse["n"] == 16
     assert (rmse["median"], rmse["low"], rmse["high"]) == pytest.approx((0.02, 0.02, 0.02))
     assert cost["field_pitch_p95_deg"] == {"n": 0, "median": None, "low": None, "high": None}
-    rows = reproduce._held_rows("rough", "free", cost)
-    assert all(len(row) == len(reproduce.HEADER) for row in rows)
+    rows = page._held_rows("rough", "free", cost)
+    assert all(len(row) == len(page.HEADER) for row in rows)
     assert rows[0][5:7] == ["16 of 18", "67.2 to 96.9 %"]  # Wilson's, by hand
     assert "2 lost, 2 gained" in rows[1][2]
 
@@ -104,8 +97,8 @@ def test_numbers_stand_beside_their_intervals():
     assert (falls["low"], falls["high"]) == pytest.approx((0.0105, 0.2698), abs=1e-4)
     few = judge(row(metric="a", label=""), total, {}, results[:4])
     assert (few["low"], few["high"]) == (None, None)
-    assert reproduce._interval(few) == ""
-    assert reproduce._interval(falls, percent=True) == "1.0 to 27.0 %"
+    assert page._interval(few) == ""
+    assert page._interval(falls, percent=True) == "1.0 to 27.0 %"
 
 
 def test_rough_ground_is_walked_on_256_fields():
@@ -121,148 +114,71 @@ def test_rough_ground_is_walked_on_256_fields():
         assert len({batch_spec(one) for one in chosen}) == 1  # one batch takes them all
 
 
-def test_an_episode_passes_if_it_did_what_was_asked():
-    axes = {axis.name: axis for axis in envelope.AXES}
-    upright = {"fell": False, "crossed": False, "velocity_late_mean_mps": 0.85}
-
-    def passed(name, value, **more):
-        return envelope._passed(axes[name], value, upright | more)
-
-    assert passed("speed_trot", 1.0)
-    assert not passed("speed_trot", 1.2)
-    assert not passed("speed_trot", 1.0, fell=True)
-    assert passed("friction_trot", 0.4, velocity_late_mean_mps=0.3)
-    assert not passed("friction_trot", 0.4)
-    assert not passed("blocks_trot", 0.05)
-    assert passed("push_bound", 5.0)
-
-
-def bears(table):
-    """A stand-in for episodes: phase -> the values that pass there."""
-    asked = []
-
-    def passes(value, phase):
-        asked.append((value, phase))
-        return value in table[phase]
-
-    return passes, asked
-
-
-def test_the_push_that_is_reported_is_that_of_the_weakest_phase():
-    """Success that is not monotone: what passes beyond a failure does not count."""
-    axis = {a.name: a for a in envelope.AXES}["push_bound"]
-    axis = dataclasses.replace(axis, easy=5.0, hard=30.0)
-    passes, asked = bears({0.0: {5, 10, 15, 20, 25, 30}, 0.3: {5, 10, 20, 25}, 0.6: {5, 10, 15}})
-    found = envelope._map(passes, axis, 5.0, [0.0, 0.3, 0.6])
-    assert (found["passed"], found["failed"]) == (10.0, 15.0)
-    assert [(p["passed"], p["failed"]) for p in found["phases"]] == [
-        (30.0, None), (10.0, 15.0), (15.0, 20.0)
-    ]  # fmt: skip
-    assert len(asked) == len(set(asked)) == 6 + 3 + 4
-
-
 @pytest.mark.parametrize(
-    ("table", "expected"),
-    [
-        ({0.0: {5, 10}, 0.5: set()}, (None, 5.0)),
-        ({0.0: {5, 10}, 0.5: {10}}, (None, 5.0)),
-        ({0.0: {5, 10}, 0.5: {5, 10}}, (10.0, None)),
-    ],
-)
-def test_a_map_that_fails_at_once_or_never(table, expected):
-    axis = dataclasses.replace(envelope.AXES[0], easy=5.0, hard=10.0)
-    passes, _ = bears(table)
-    found = envelope._map(passes, axis, 5.0, list(table))
-    assert (found["passed"], found["failed"]) == expected
-    shown = envelope._shown({**found, "unit": "N s", "easy": 5.0})
-    assert "every phase" in shown or "at some phase" in shown
-
-
-def search(name, answer, seeds=20):
-    """Search an axis with a stand-in that answers each episode's config, early ends included."""
-    axis = {a.name: a for a in envelope.AXES}[name]
-
-    def run(configs, label="", enough=None):
-        results = []
-        for config in configs:
-            results.append(answer(config))
-            if enough(results):
-                break
-        return results + [None] * (len(configs) - len(results))
-
-    return envelope._search(axis, "planar", Namespace(quick=False, seeds=seeds), run)
-
-
-def test_the_speed_that_was_reached_stands_beside_the_one_that_passes():
-    """A robot that walks 15 % too slowly up to 1 m/s, and stays at 0.85 m/s."""
-
-    def answer(config):
-        wanted = config.command.v_x[-1]
-        return {"fell": False, "velocity_late_mean_mps": min(0.85 * wanted, 0.85)}
-
-    one = search("speed_trot", answer)
-    assert one["passed"] <= 0.85 / 0.8 < one["failed"]
-    assert one["reached_mps"] == pytest.approx(min(0.85 * one["passed"], 0.85))
-    assert "the speed reached is 0.85 m/s" in envelope._shown(one)
-
-
-def test_pushes_come_at_every_phase_of_the_cycle_and_two_falls_of_twenty_are_too_many():
-    seen = set()
-
-    def answer(config):
-        seen.add(config.push.times[0])
-        late = config.push.times[0] - 3.0
-        return {"fell": config.push.forward > 10.0 and late > 0.22 and config.seed < 2}
-
-    one = search("push_bound", answer)
-    # By hand: the bound's cycle is 0.35 s, seven phases are 0.05 s apart.
-    assert sorted(seen) == pytest.approx([3.0 + 0.05 * i for i in range(7)])
-    assert [p["late_s"] for p in one["phases"]] == pytest.approx([0.05 * i for i in range(7)])
-    assert (one["passed"], one["failed"]) == (10.0, 12.5)
-    assert [p["passed"] for p in one["phases"]] == [40.0] * 5 + [10.0] * 2
-    shown = envelope._shown(one)
-    assert "10 N s passes at every phase, 12.5 does not; from phase to phase: 40" in shown
-
-    def seldom(config):
-        return {"fell": config.seed == 3}
-
-    assert search("push_bound", seldom)["passed"] == 40.0
-
-
-def test_the_figure_shows_maps_and_speeds(tmp_path):
-    from kjax.viz.report import envelope_figure
-
-    found = {
-        "a": search("push_bound", lambda c: {"fell": c.push.forward > 20.0}),
-        "b": search("speed_trot", lambda c: {"fell": True}),
-        "c": search("speed_bound", lambda c: {
-            "fell": False, "velocity_late_mean_mps": c.command.v_x[-1]}),
-    }  # fmt: skip
-    envelope_figure(found, tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 5000
-    assert json.loads(json.dumps(found))["b"]["passed"] is None
-
-
-@pytest.mark.parametrize(
-    ("main", "words", "part"),
+    ("words", "part"),
     [
         (
-            reproduce.main,
             ["--only", "trott"],
             "--only: got 'trott', wanted some of koopman_fit, trot",
         ),
-        (reproduce.main, ["--seeds", "0"], "--seeds: got 0, wanted at least 1"),
-        (reproduce.main, ["--base", "both", "--terrains", "x"], "--terrains"),
-        (envelope.main, ["--only", "speed"], "wanted some of speed_trot"),
-        (envelope.main, ["--jobs", "0"], "--jobs: got 0, wanted at least 1"),
-        (envelope.main, ["--sedes", "3"], "--sedes"),
+        (["--seeds", "0"], "--seeds: got 0, wanted at least 1"),
+        (["--base", "both", "--terrains", "x"], "--terrains"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(call, main, words, part, capsys):
-    assert call(main, *words) == 2
+def test_a_mistake_is_one_line_and_exit_code_2(call, words, part, capsys):
+    assert call(reproduce.main, *words) == 2
     text = capsys.readouterr().err
     assert text.count("\n") == 1, text
     assert part in text
+
+
+@pytest.fixture
+def episodes(monkeypatch, standing_run):
+    """Stand in for episodes: robots stand still. ``run`` lists those that were run."""
+    log = SimpleNamespace(run=[], stop_at=None)
+
+    def episode(config, record, path):
+        if len(log.run) == log.stop_at:
+            raise KeyboardInterrupt
+        log.run.append(config)
+        run = standing_run(config, config.duration)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        record(run, path)
+        return metrics(run, config)
+
+    monkeypatch.setattr("kjax.runs.pool._episode", episode)
+    return log
+
+
+def test_flat_ground_goes_on_after_ctrl_c_and_leaves_page_table_and_figures(
+    episodes, call, capsys, tmp_path
+):
+    only = ("--only", "trot_velocity", "trot_to_bound")
+    words = ("--quick", "--jobs", 1, "--base", "planar", *only, "--out", tmp_path)
+    episodes.stop_at = 3
+    assert call(reproduce.main, *words) == 130
+    assert "the same command goes on" in capsys.readouterr().out
+    assert not (tmp_path / "index.html").exists()
+    episodes.stop_at = None
+    assert call(reproduce.main, *words) == 0
+    assert len(episodes.run) == 4  # two seeds of each, none of them twice
+    found = json.loads((tmp_path / "results.json").read_text())["experiments"]
+    assert set(found) == {"trot_velocity", "trot_to_bound"}
+    rows = {row["metric"]: row for row in found["trot_velocity"]["planar"]["rows"]}
+    # It stands still and is asked for nothing in its first second and a half.
+    assert rows["velocity_rmse_mps"]["median"] == 0.0
+    assert rows["falls"]["met"] is True
+    assert rows["falls"]["high"] == pytest.approx(0.6576, abs=1e-4)  # Wilson's, of 0 of 2
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert names == {"trot_velocity_planar.png", "switches_planar.png"}
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    assert lines[0] == "| " + " | ".join(page.HEADER) + " |"
+    assert any(line.startswith("| trot steps, 6 x 1 ms | planar | falls |") for line in lines)
+    assert "A quick check of the machinery: this is no result." in lines
+    html = (tmp_path / "index.html").read_text()
+    for name in names:
+        assert f'<img src="figures/{name}"' in html
+    assert "trot_velocity (free)" in capsys.readouterr().out  # not finished, so not on the page
 
 
 @pytest.mark.slow
@@ -282,8 +198,8 @@ def test_a_quick_reproduction_leaves_page_table_and_json_and_goes_on(
     assert one["rows"][0]["target"] == 0.98
     assert one["held"]["cost"]["crossed"]["fields"] == 2
     assert len(Cache(tmp_path)) == 4
-    page = (tmp_path / "index.html").read_text()
-    assert "figures/trot_rough_planar.png" in page
+    html = (tmp_path / "index.html").read_text()
+    assert "figures/trot_rough_planar.png" in html
     assert (tmp_path / "figures" / "trot_rough_planar.png").exists()
     assert "rough trot" in (tmp_path / "table.md").read_text()
     assert "rough trot, 0.3 m/s, torques held" in (tmp_path / "table.md").read_text()

@@ -1,46 +1,40 @@
-import json
-import os
-import subprocess
-import sys
+"""Tuning as a script: what it descends on, keeps, finds again and compares."""
 
+import json
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from kjax import RunConfig, load_config
-
-pytestmark = pytest.mark.slow
+from kjax.runs.cache import Cache
+from kjax.studies.tune import study
+from kjax.tuning.space import build_space
 
 
 @pytest.fixture(scope="module")
-def tune(repository):
-    """Run tune.py with these words."""
-
-    def call(*words):
-        return subprocess.run(
-            [sys.executable, os.fspath(repository / "experiments" / "tune.py"), *words],
-            capture_output=True,
-            text=True,
-            cwd=repository,
-            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(repository / ".cache" / "jax")},
-            timeout=900,
-        )
-
-    return call
+def small(repository):
+    """Words of a tuning of seconds."""
+    return (
+        repository / "configs" / "trot_velocity_long.toml", "--seconds", "0.2", "--scenarios", "2",
+        "--held-out", "2", "--updates", "5", "--worsen", "3", "--seeds", "2", "--duration", "0.6",
+        "--command.times", "[0.0]", "--command.v_x", "[0.2]",
+    )  # fmt: skip
 
 
-SMALL = (
-    "configs/trot_velocity_long.toml", "--seconds", "0.2", "--scenarios", "2", "--held-out", "2",
-    "--updates", "5", "--worsen", "3", "--seeds", "2", "--duration", "0.6",
-    "--command.times", "[0.0]", "--command.v_x", "[0.2]",
-)  # fmt: skip
-
-
-def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(tune, tmp_path):
-    done = tune(*SMALL, "--out", str(tmp_path))
-    assert done.returncode == 0, done.stderr
+@pytest.mark.slow
+def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(
+    call, small, capsys, tmp_path
+):
+    assert call(study.main, *small, "--out", tmp_path) == 0
     record = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert set(record["mujoco"]) == {"own", "start", "gradient"}
     assert all(entry["runs"] == 2 for entry in record["mujoco"].values())
-    assert record["held_out_cost"]["gradient"] <= record["held_out_cost"]["start"]
+    # The start counts among the points that the best is chosen from: only less than it says
+    # that the descent descended.
+    assert record["held_out_cost"]["gradient"] < record["held_out_cost"]["start"]
+    assert record["descent"]["best_update"] > 0
     assert record["descent"]["updates"] == 5
     assert len(record["values"]["start"]["lmpc.Q"]) == 6
     assert {p.name for p in tmp_path.iterdir()} >= {"tuned.toml", "table.md", "figure.png"}
@@ -48,11 +42,144 @@ def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(t
     assert list(tuned.lmpc.Q) == pytest.approx(record["values"]["gradient"]["lmpc.Q"])
     # Again: the descent is found. Other speeds are another tuning, and leave the first one.
     assert len(list((tmp_path / "cache").iterdir())) == 1
-    assert tune(*SMALL, "--out", str(tmp_path)).returncode == 0
+    assert call(study.main, *small, "--out", tmp_path) == 0
     assert len(list((tmp_path / "cache").iterdir())) == 1
-    other = tune(*SMALL, "--command.v_x", "[0.1]", "--out", str(tmp_path))
-    assert other.returncode == 0, other.stderr
+    assert call(study.main, *small, "--command.v_x", "[0.1]", "--out", tmp_path) == 0
     assert len(list((tmp_path / "cache").iterdir())) == 2
+
+
+@pytest.fixture
+def bowl(monkeypatch):
+    """Stand in for closed loops: a cost that is least at the config's own parameters."""
+    log = SimpleNamespace(tried=[])
+
+    def build_objective(config, space, *, memory):
+        def objective(variables, scenario):
+            off = [jnp.sum((variables[key] - space.start[key]) ** 2) for key in space.start]
+            return 1.0 + sum(off)
+
+        return objective
+
+    def verdict_of(config, overrides, seeds):
+        log.tried.append(overrides)
+        return {"runs": seeds, "falls": 0, "cost_median": 0.5,
+                "velocity_rmse_mps": {"median": 0.02, "worst": 0.03, "n": seeds}}  # fmt: skip
+
+    def traces(config, space, sets, scenarios):
+        run = SimpleNamespace(
+            x=np.zeros((40, 6)), wanted=np.zeros((40, 1)), alive=np.ones(40, bool)
+        )
+        return dict.fromkeys(sets, run)
+
+    for stand_in in (build_objective, verdict_of, traces):
+        monkeypatch.setattr(study, stand_in.__name__, stand_in)
+    return log
+
+
+def test_a_descent_comes_back_to_the_parameters_that_it_was_put_off(
+    bowl, call, small, capsys, tmp_path
+):
+    words = (*small, "--updates", 60, "--out", tmp_path)
+    assert call(study.main, *words) == 0
+    record = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
+    costs = record["held_out_cost"]
+    assert costs["own"] == pytest.approx(1.0)
+    # Put off by a factor of 3: log(3)^2 for each of the six weights of Q and the one of R.
+    assert costs["start"] == pytest.approx(1.0 + 7 * np.log(3.0) ** 2, rel=1e-3)
+    assert costs["gradient"] < 1.2
+    assert record["cost_over_own"]["gradient"] == pytest.approx(costs["gradient"])
+    values = record["values"]
+    np.testing.assert_allclose(values["gradient"]["lmpc.Q"], values["own"]["lmpc.Q"], rtol=0.3)
+    off = np.array(values["start"]["lmpc.Q"]) / values["own"]["lmpc.Q"]
+    np.testing.assert_allclose(np.maximum(off, 1.0 / off), 3.0, rtol=1e-6)
+    assert [one["lmpc.Q"] for one in bowl.tried] == [
+        values[name]["lmpc.Q"] for name in ("own", "start", "gradient")
+    ]
+    tuned = load_config(RunConfig, tmp_path / "tuned.toml")
+    assert list(tuned.lmpc.Q) == pytest.approx(values["gradient"]["lmpc.Q"])
+    text = (tmp_path / "table.md").read_text()
+    assert "| own | 1.000 | 0 of 2 | 0.02 (0.03) | - | 0.500 |" in text
+    assert (tmp_path / "figure.png").stat().st_size > 10_000
+    # The same command finds the descent: no update is made again.
+    first = record["descent"]
+    assert call(study.main, *words) == 0
+    again = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))["descent"]
+    assert again["cost"] == first["cost"]
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def test_a_descent_that_breaks_off_keeps_its_last_good_point_and_says_so(
+    bowl, call, small, capsys, monkeypatch, tmp_path
+):
+    sound = study.descend
+
+    def broken(*positional, **named):
+        return sound(*positional, **named)._replace(healthy=False, stopped="cost is not finite")
+
+    monkeypatch.setattr(study, "descend", broken)
+    assert call(study.main, *small, "--out", tmp_path) == 2
+    assert "the descent broke off: cost is not finite" in capsys.readouterr().err
+    assert (tmp_path / "tuned.toml").exists()
+
+
+def test_ctrl_c_is_exit_code_130(bowl, call, small, capsys, monkeypatch, tmp_path):
+    def interrupted(*positional, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study, "descend", interrupted)
+    assert call(study.main, *small, "--out", tmp_path) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+
+
+@pytest.fixture
+def evolution(monkeypatch, repository, tmp_path):
+    """CMA-ES on stand-ins: the cost of a candidate is how far its weights are off."""
+    pytest.importorskip("cma")
+    config = load_config(RunConfig, repository / "configs" / "trot_velocity_long.toml")
+    space = build_space(config, ("lmpc.Q",))
+    log = SimpleNamespace(asked=[], stop_at=None)
+
+    class Engine:
+        def __init__(self, config, torques):
+            assert torques == "held"
+
+        def run(self, configs):
+            if len(log.asked) == log.stop_at:
+                return SimpleNamespace(interrupted=True)
+            log.asked.append([one.lmpc.Q for one in configs])
+            return SimpleNamespace(interrupted=False, configs=configs)
+
+    def costs(recording):
+        weights = np.log([one.lmpc.Q for one in recording.configs])
+        return ((weights - np.log(config.lmpc.Q)) ** 2).sum(axis=1)
+
+    monkeypatch.setattr(study, "BatchEngine", Engine)
+    monkeypatch.setattr(study, "recording_costs", costs)
+    args = SimpleNamespace(speeds=(0.0, 0.3), seconds=0.2, pieces=2)
+    begin = study.worsened(space, 2.0, 0)
+
+    def evolve(folder, stop_at):
+        log.asked.clear()
+        log.stop_at = stop_at
+        cache = Cache(tmp_path / folder)
+        try:
+            study.evolve(config, space, begin, args, 1e6, cache, "key")
+        except KeyboardInterrupt:
+            return list(log.asked), cache.arrays("key")
+        raise AssertionError("it was to be interrupted")
+
+    return evolve
+
+
+def test_an_evolution_that_was_interrupted_goes_on_as_if_it_had_not_been(evolution):
+    whole, kept = evolution("whole", 5)
+    assert kept["costs"].shape == (5, len(whole[0]) // study.POPULATION_SEEDS)
+    first, _ = evolution("cut", 3)
+    rest, again = evolution("cut", 2)
+    assert first + rest == whole
+    np.testing.assert_array_equal(again["costs"], kept["costs"])
+    best = kept["costs"].min(axis=1)
+    assert best[-1] < best[0]  # it searches
 
 
 @pytest.mark.parametrize(
@@ -65,8 +192,9 @@ def test_a_tuning_leaves_a_config_a_verdict_and_pictures_and_is_not_done_twice(t
     ],
     ids=["key", "count", "base", "option"],
 )
-def test_a_mistake_is_one_line(tune, tmp_path, words, text):
-    done = tune("configs/trot_velocity.toml", *words, "--out", str(tmp_path))
-    assert done.returncode == 2
-    assert text in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+def test_a_mistake_is_one_line(call, repository, capsys, tmp_path, words, text):
+    config = repository / "configs" / "trot_velocity.toml"
+    assert call(study.main, config, *words, "--out", tmp_path) == 2
+    err = capsys.readouterr().err
+    assert text in err
+    assert len(err.strip().splitlines()) == 1

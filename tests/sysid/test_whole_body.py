@@ -1,18 +1,11 @@
 """Models from whole-body episodes, on episodes made here from a known residual."""
 
-import json
-import os
-import subprocess
-import sys
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.prediction import families, features, storage
-from kjax.studies.whole_body import recordings
+from kjax.prediction import families, features
 from kjax.sysid import open_loop, whole_body
 from kjax.sysid.transitions import Episode, split, transitions
 from kjax.types import MODE_ALPHA, Mode
@@ -285,47 +278,3 @@ def test_what_cannot_be_used_is_said(body, weights):
     still = one._replace(stance=np.ones_like(one.stance))
     with pytest.raises(ValueError, match="at least one whole phase"):
         transitions([still], dt=DT, sole=SOLE)
-
-
-@pytest.mark.slow
-def test_the_experiment_runs_and_records_once(repository, tmp_path, monkeypatch, capsys):
-    environment = {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": str(repository / ".cache" / "jax"),
-    }
-    done = subprocess.run(
-        [sys.executable, "experiments/whole_body.py", "--quick", "--out", str(tmp_path)],
-        cwd=repository,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "recording" in done.stdout
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {
-        "metrics.json", "table.md", "details.json", "figure.png",
-        "residual_trot.npz", "residual_bound.npz",
-        "residual_trot_clock_history.npz", "residual_bound_clock_history.npz",
-        "weights_trot.npz", "weights_bound.npz", "cache",
-    }  # fmt: skip
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    # Ten short episodes already: the limits of the whole study with some room.
-    assert 0.0 < metrics["residual_velocity_ratio_50ms"] < 0.35
-    assert 0.0 < metrics["residual_pitch_rate_ratio_50ms"] < 0.85
-    trot, bound = (
-        storage.load(tmp_path / f"residual_{gait}.npz", "residual") for gait in ("trot", "bound")
-    )
-    assert trot.params.shape == (len(Mode), 6, 17)
-    assert trot.params[Mode.TROT].any()
-    assert not trot.params[Mode.REAR].any()
-    assert bound.params[Mode.FRONT].any()
-    # One tick's error of the velocity after 5 ms: millimetres per second.
-    assert (trot.spread[Mode.TROT, 3:5] > 1e-4).all()
-    assert (trot.spread[Mode.TROT, 3:5] < 2e-2).all()
-    # What lies there is taken, and only that.
-    options = SimpleNamespace(robots=10, duration=3.0, force=15.0)
-    episodes = recordings.record("trot", options, tmp_path)
-    assert len(episodes) == 10
-    assert capsys.readouterr().out == "trot: 10 episodes of 3 s are there\n"

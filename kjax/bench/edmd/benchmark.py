@@ -10,7 +10,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -18,13 +17,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from tqdm import tqdm
 
 from kjax import cli
+from kjax.bench.edmd import report
 from kjax.bench.edmd.data import (
+    DICTIONARIES,
+    LOOP,
     PAPER,
+    SEEDS,
+    VELOCITIES,
     Setting,
     numpy_draw,
     numpy_loop,
@@ -33,10 +36,10 @@ from kjax.bench.edmd.data import (
     setting,
 )
 from kjax.bench.edmd.stream import STREAM, stream
+from kjax.bench.timing import Call, elapsed, interleaved
 from kjax.config import KoopmanConfig
 from kjax.koopman import edmd, models, observables, regression
 from kjax.koopman.dataset import Snapshots
-from kjax.types import STATE_NAMES
 
 PEERS = ("pykoopman", "pykoop")
 SCRIPT = Path(__file__).with_name("peers.py")
@@ -44,18 +47,13 @@ THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 ROUNDS = 3  # of every timing, in turn with those beside it; medians over all calls are reported
 CALLS = 30  # timed fits in a round
-SEEDS = 10
-# (order, with the constant rotation): the paper's first, all of them cuts of the largest.
-DICTIONARIES = tuple((order, constant) for order in (4, 3, 2, 1, 0) for constant in (False, True))
 LARGEST = observables.paper(4, constant_rotation=True)
 
 KEYS = ("fit_ms", "regression_ms", "many_s", "many_lifted_s")
 
 TEST_ROLLOUTS, TEST_STEPS = 100, 50  # held out
-VELOCITIES = slice(3, 6)
 
 ROLLOUTS = 10_000  # whose generation is timed
-LOOP = 20  # of them in the loop over rollouts and steps; the rest by proportion
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,8 +82,8 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     print("rollouts")
     result["rollouts"] = rollouts(here, ROLLOUTS // 10 if quick else ROLLOUTS, LOOP)
     result |= summary(result)
-    (folder / "table.md").write_text(table(result), encoding="utf-8")
-    figure(result, folder / "figure.png")
+    (folder / "table.md").write_text(report.table(result), encoding="utf-8")
+    report.figure(result, folder / "figure.png")
     return result
 
 
@@ -112,7 +110,7 @@ def summary(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def _one_thread() -> None:
-    """Start this program anew with one thread for linear algebra, unless it was started so.
+    """Restart this program with one thread for linear algebra, unless it was started so.
 
     OpenBLAS reads the number when it is loaded, which is before the first line of ours.
     """
@@ -120,12 +118,6 @@ def _one_thread() -> None:
         sys.stdout.flush()
         environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
-
-
-def _timed(call: Callable[[], Any]) -> float:
-    clock = time.perf_counter()
-    jax.block_until_ready(call())
-    return time.perf_counter() - clock
 
 
 # ---------------------------------------------------------------- fits
@@ -154,21 +146,21 @@ def fits(here: Setting, python: str | None, versions: Any, calls: int) -> dict[s
     for call, _, _ in ours.values():
         jax.block_until_ready(call())
     times: dict[str, dict[str, list[float]]] = {key: {"kjax": []} for key in KEYS}
-    ends = {"kjax": np.asarray(predict(fit(first)[0], test))}
-    done = {}
+    predicted = {"kjax": np.asarray(predict(fit(first)[0], test))}
+    done: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "data.npz"
         np.savez(path, states=data.states, inputs=data.inputs, test_states=test.states,
                  test_inputs=test.inputs, dictionaries=DICTIONARIES, calls=calls)  # fmt: skip
         for _ in tqdm(range(ROUNDS), desc="rounds", leave=False, disable=None):
             for key, (call, count, unit) in ours.items():
-                times[key]["kjax"] += [unit * _timed(call) for _ in range(count)]
+                times[key]["kjax"] += [unit * elapsed(call) for _ in range(count)]
             times["many_lifted_s"]["kjax"] = times["many_s"]["kjax"]  # it lifts once as it is
             for name, entry in (_peers(python, path) if versions else {}).items():
                 for key in KEYS:
                     values = entry[key] if isinstance(entry[key], list) else [entry[key]]
                     times[key].setdefault(name, []).extend(values)
-                ends[name] = np.asarray(entry["end"])
+                predicted[name] = np.asarray(entry["end"])
                 done[name] = min(entry["many_done"], done.get(name, len(DICTIONARIES) * SEEDS))
     result: dict[str, Any] = {
         key: {name: float(np.median(values)) for name, values in entry.items()}
@@ -180,7 +172,7 @@ def fits(here: Setting, python: str | None, versions: Any, calls: int) -> dict[s
             "max": np.abs(end - truth).max(axis=0)[VELOCITIES],
             "rms": np.sqrt(((end - truth) ** 2).mean(axis=0))[VELOCITIES],
         }
-        for name, end in ends.items()
+        for name, end in predicted.items()
     }
     result["many_timed"] = done
     return result
@@ -245,96 +237,16 @@ def _peers(python: str | None, data: Path) -> dict[str, Any]:
 
 
 def rollouts(here: Setting, count: int, looped: int) -> dict[str, float]:
-    """Rollouts per second, random numbers included: kjax, a NumPy loop, vectorised NumPy."""
+    """Rollouts per second, random draws included: kjax, a NumPy loop, vectorised NumPy."""
     draw, key, rng = sampler(here, count, here.steps), jax.random.key(0), np.random.default_rng(0)
     body, alpha = jax.tree.map(np.asarray, here.body), np.asarray(here.alpha)
-    calls = {
-        "kjax": (lambda: draw(key), count),
-        "numpy_vectorised": (
-            lambda: numpy_rollouts(body, alpha, *numpy_draw(rng, here, count), here.dt),
-            count,
+    calls: dict[str, Call] = {
+        "kjax": lambda _: draw(key),
+        "numpy_vectorised": lambda _: numpy_rollouts(
+            body, alpha, *numpy_draw(rng, here, count), here.dt
         ),
-        "numpy_loop": (
-            lambda: numpy_loop(body, alpha, *numpy_draw(rng, here, looped), here.dt),
-            looped,
-        ),
+        "numpy_loop": lambda _: numpy_loop(body, alpha, *numpy_draw(rng, here, looped), here.dt),
     }
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for round_ in range(2 * ROUNDS + 1):  # the first one warms up
-        for name, (call, number) in calls.items():
-            spent = _timed(call)
-            if round_:
-                times[name].append(spent / number)
-    return {name: 1.0 / float(np.median(values)) for name, values in times.items()}
-
-
-# ---------------------------------------------------------------- presentation
-
-
-def table(result: dict[str, Any]) -> str:
-    """All of it as Markdown."""
-    found, data, flow = result["fits"], result["rollouts"], result["stream"]
-    names = list(found["fit_ms"])
-    titles = [f"{name} {result['peers'].get(name, '')}".strip() for name in names]
-    lines = [f"| one fit, {PAPER.size} observables | {' | '.join(titles)} |",
-             "|---" * (len(names) + 1) + "|"]  # fmt: skip
-    for key, title, unit in (
-        ("fit_ms", "10,000 snapshots, from states", "ms"),
-        ("regression_ms", "the regression alone, from lifted states", "ms"),
-        ("many_s", "100 fits, from states", "s"),
-        ("many_lifted_s", "100 fits, each data set lifted once", "s"),
-    ):
-        values = " | ".join(f"{found[key][name]:.3g} {unit}" for name in names)
-        lines.append(f"| {title} | {values} |")
-    for i, velocity in enumerate(STATE_NAMES[VELOCITIES]):
-        values = " | ".join(f"{found['error'][name]['max'][i]:.2e}" for name in names)
-        unit = "rad/s" if velocity == "omega" else "m/s"
-        lines.append(f"| largest error of {velocity} after 50 ms [{unit}] | {values} |")
-    if result["missing"]:
-        lines.append(f"\nNot measured: {', '.join(result['missing'])}.")
-    part = {name: n for name, n in found["many_timed"].items() if n < len(DICTIONARIES) * SEEDS}
-    for name, number in part.items():
-        lines.append(f"\nOf the 100 fits of {name}, {number} were timed; the rest by proportion.")
-    lines += ["", "| rollouts of 100 steps | per second |", "|---|---|"]
-    for name, title in (
-        ("kjax", "kjax, one compiled call"),
-        ("numpy_vectorised", "NumPy, vectorised over rollouts"),
-        ("numpy_loop", f"NumPy, rollout by rollout and step by step ({LOOP} timed)"),
-    ):
-        lines.append(f"| {title} | {data[name]:,.0f} |")
-    lines += [
-        "",
-        f"| stream of {flow['snapshots']:,} snapshots | |",
-        "|---|---|",
-        f"| lifted and into the QR factor | {flow['snapshots_per_s']:,.0f} per second |",
-        f"| with their drawing | {flow['snapshots_per_s_with_drawing']:,.0f} per second |",
-        f"| peak memory, programs included | {flow['peak_MB']:.0f} MB |",
-        f"| of it after the first hundredth | {flow['growth_MB']:.0f} MB |",
-        f"| what all rows would take | {flow['all_rows_MB']:,.0f} MB |",
-        f"| coefficients, relative to one factorisation | {flow['coefficients_difference']:.1e} |",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def figure(result: dict[str, Any], path: Path) -> None:
-    """Times of the fits and rates of the rollouts."""
-    fig, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
-    found, data = result["fits"], result["rollouts"]
-    panels = (
-        ("fit_ms", "regression_ms", "regression alone", "one fit, 10,000 snapshots", "ms"),
-        ("many_s", "many_lifted_s", "lifted once", "10 data sets x 10 dictionaries", "s"),
-    )
-    for ax, (*keys, label, title, unit) in zip(axes[:2], panels, strict=True):
-        labels = ("from states", label)
-        names = list(found[keys[0]])
-        place = np.arange(len(names))
-        for i, (key, label) in enumerate(zip(keys, labels, strict=True)):
-            ax.bar(place + 0.4 * i - 0.2, [found[key][n] for n in names], 0.4, label=label)
-        ax.set_xticks(place, names)
-        ax.set(title=title, ylabel=f"time [{unit}]")
-        ax.legend(fontsize=8)
-    labels = ("kjax", "NumPy,\nvectorised", "NumPy,\nloop")
-    axes[2].bar(labels, [data[n] for n in ("kjax", "numpy_vectorised", "numpy_loop")])
-    axes[2].set(title="data: rollouts of 100 steps", ylabel="rollouts per second", yscale="log")
-    fig.savefig(path, dpi=120)
-    plt.close(fig)
+    drawn = {"kjax": count, "numpy_vectorised": count, "numpy_loop": looped}
+    times = interleaved(calls, 2 * ROUNDS)
+    return {name: drawn[name] / float(np.median(times[name])) for name in calls}

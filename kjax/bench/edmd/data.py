@@ -17,6 +17,11 @@ from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 PAPER = observables.paper(4)
+SEEDS = 10  # data sets
+# (order, with the constant rotation): the paper's first, all of them parts of the largest.
+DICTIONARIES = tuple((order, constant) for order in (4, 3, 2, 1, 0) for constant in (False, True))
+VELOCITIES = slice(3, 6)  # of a state
+LOOP = 20  # rollouts of the loop over rollouts and steps; the others by proportion
 
 
 class Setting(NamedTuple):
@@ -52,7 +57,9 @@ def sampler(here: Setting, rollouts: int, steps: int) -> Callable[[jax.Array], S
     )
 
 
-def numpy_draw(rng: np.random.Generator, here: Setting, count: int) -> tuple[np.ndarray, ...]:
+def numpy_draw(
+    rng: np.random.Generator, here: Setting, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Initial states (count, 6) and forces (count, steps, 4) in the ranges of the setting."""
     ranges = jax.tree.map(np.asarray, here.ranges)
     x0 = ranges.state_centre + ranges.state_half * rng.uniform(-1.0, 1.0, (count, 6))
@@ -73,8 +80,8 @@ def numpy_rollouts(
         force_x, force_z = (x_front + x_rear) / body.mass, (z_front + z_rear) / body.mass
         (x_f, z_f), (x_r, z_r) = body.feet
         moment = x_f * z_front - z_f * x_front + x_r * z_rear - z_r * x_rear
-        turn = moment / body.inertia
-        derivative = partial(_derivative, force_x, force_z, turn)
+        pitch_acceleration = moment / body.inertia
+        derivative = partial(_derivative, force_x, force_z, pitch_acceleration)
         states[t + 1] = _rk4(derivative, states[t], dt)
     return states.transpose(2, 0, 1)
 
@@ -88,15 +95,15 @@ def _rk4(derivative: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: floa
 
 
 def _derivative(
-    force_x: np.ndarray, force_z: np.ndarray, turn: np.ndarray, x: np.ndarray
+    force_x: np.ndarray, force_z: np.ndarray, pitch_acceleration: np.ndarray, x: np.ndarray
 ) -> np.ndarray:
-    """Derivative (6, rollouts); forces per mass [m/s^2] in the body frame, turn [rad/s^2]."""
+    """Derivative (6, rollouts); forces per mass in the body frame [m/s^2], pitch in [rad/s^2]."""
     out = np.empty_like(x)
     c, s = np.cos(x[2]), np.sin(x[2])
     out[:3] = x[3:]
     out[3] = c * force_x - s * force_z
     out[4] = s * force_x + c * force_z - GRAVITY
-    out[5] = turn
+    out[5] = pitch_acceleration
     return out
 
 

@@ -29,7 +29,9 @@ NETWORKS = ("torch", "torch.nn", "torch.nn.utils", "torch.nn.utils.rnn", "torch.
 class _Absent(types.ModuleType):
     """A module whose every name is an empty class."""
 
-    __path__ = ()
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.__path__ = []
 
     def __getattr__(self, name: str) -> type:
         if name.startswith("__"):

@@ -1,6 +1,5 @@
 """Snapshots that stream through the incremental QR; for benchmark.py edmd."""
 
-import resource
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -11,6 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from kjax.bench.edmd.data import PAPER, Setting, sampler
+from kjax.bench.machine import peak_memory
 from kjax.koopman import edmd, regression
 from kjax.koopman.dataset import Snapshots
 
@@ -28,7 +28,7 @@ def stream(here: Setting, total: int) -> dict[str, float]:
       coefficients of the first blocks and of one factorisation of the same rows, relative to the
       largest coefficient, in scaled columns.
     """
-    before = _resident()
+    before = peak_memory()
     draw, size = sampler(here, here.rollouts, here.steps), here.rollouts * here.steps
     pushes = max(1, total // size)
     kept: list[Snapshots] = []
@@ -46,8 +46,8 @@ def stream(here: Setting, total: int) -> dict[str, float]:
             kept.append(data)
             part = factor
         if i == max(9, pushes // 100):
-            early = _resident()
-    peak = _resident()
+            early = peak_memory()
+    peak = peak_memory()
     columns = factor.R.shape[0]
     return {
         "snapshots": pushes * size,
@@ -84,8 +84,3 @@ def difference_from_one_shot(factor: regression.QrFactor, data: Sequence[Snapsho
     scale = np.linalg.norm(np.asarray(rows.R)[:, :columns], axis=0)[:, None]
     wanted, found = (scale * np.asarray(solve(one).W) for one in (rows, factor))
     return float(np.abs(found - wanted).max() / np.abs(wanted).max())
-
-
-def _resident() -> float:
-    """Largest resident memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

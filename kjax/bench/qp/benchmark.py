@@ -2,7 +2,6 @@
 
 import argparse
 import importlib
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ import numpy as np
 
 from kjax import cli, qp
 from kjax.bench.qp import checks, random_rows, report
-from kjax.bench.qp.peers import box_peers, daqp_cold
+from kjax.bench.qp.peers import Solver, box_peers, daqp_cold
 from kjax.bench.qp.problems import record_box, record_rows
+from kjax.bench.timing import Call, median_us
 
 BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
 HORIZONS = {40: 10, 80: 20, 200: 50, 400: 100}  # variables: steps of 20 ms of the long trot
@@ -122,23 +122,16 @@ def _import(name: str) -> Any:
         return None
 
 
-def _timed(call: Callable[[int], Any], indices: Any) -> float:
-    """Median time of a call [us]."""
-    times = []
-    for i in indices:
-        clock = time.perf_counter()
-        call(i)
-        times.append(time.perf_counter() - clock)
-    return 1e6 * float(np.median(times))
-
-
 def box_single(log: dict[str, Any], peers: dict[str, Any], count: int = 400) -> dict[str, Any]:
     """Latency of calls from Python along the log, tick by tick, and how good their points are."""
     q, lower, upper, mode = (log[k][:count] for k in ("q", "lower", "upper", "mode"))
     ticks, prepared = range(len(q)), log["prepared"]
 
     # Bounds change with the mode only: they stay in the compiled program, as H does.
-    bounds = {int(m): (lower[mode == m][0], upper[mode == m][0]) for m in np.unique(mode)}
+    bounds = {
+        int(m): (jnp.asarray(lower[mode == m][0]), jnp.asarray(upper[mode == m][0]))
+        for m in np.unique(mode)
+    }
     calls = {
         m: jax.jit(_one_mode(jax.tree.map(lambda a, m=m: a[m], prepared), *sides))
         for m, sides in bounds.items()
@@ -154,10 +147,13 @@ def box_single(log: dict[str, Any], peers: dict[str, Any], count: int = 400) -> 
         state["warm"][m] = warm
         return np.asarray(x)
 
+    def on_tick(by_mode: dict[int, Solver]) -> Callable[[int], np.ndarray]:
+        return lambda i: by_mode[int(mode[i])](q[i], lower[i], upper[i])
+
     solvers: dict[str, Callable[[int], np.ndarray]] = {"kjax tableau, warm": ours}
     for name, make in box_peers(peers).items():
         by_mode = {int(m): make(log["H"][m]) for m in np.unique(mode)}
-        solvers[name] = lambda i, by_mode=by_mode: by_mode[int(mode[i])](q[i], lower[i], upper[i])
+        solvers[name] = on_tick(by_mode)
     noop = jax.jit(lambda q, warm: (q + 1.0, warm))
     solvers["empty jitted call"] = lambda i: np.asarray(noop(q[i], state["warm"][int(mode[i])])[0])
     wanted = _reference(log, ticks)
@@ -168,7 +164,7 @@ def box_single(log: dict[str, Any], peers: dict[str, Any], count: int = 400) -> 
         for name, solve in solvers.items():
             if round_ == 0:
                 points[name] = [solve(i) for i in ticks]  # also warms up
-            times[name].append(_timed(solve, ticks))
+            times[name].append(median_us(solve, ticks))
     residual = jax.jit(qp.kkt_residual)
     for name, values in times.items():
         entry = {"us_median": float(np.median(values))}
@@ -183,7 +179,7 @@ def box_single(log: dict[str, Any], peers: dict[str, Any], count: int = 400) -> 
     return result
 
 
-def _one_mode(prepared: Any, lower: np.ndarray, upper: np.ndarray) -> Callable[..., Any]:
+def _one_mode(prepared: Any, lower: Any, upper: Any) -> Callable[..., Any]:
     def call(q: Any, warm: Any) -> Any:
         solution = qp.solve(prepared, q, lower, upper, warm)
         return solution.x, solution.warm
@@ -235,10 +231,17 @@ def box_in_scan(log: dict[str, Any]) -> dict[str, Any]:
                 lambda carry, row: tick(carry, row, weight), start, rows
             )[1]
         )
-        jax.block_until_ready(scan(data))
-        spent = _timed(lambda _, scan=scan: jax.block_until_ready(scan(data)), range(15))
+        spent = median_us(_on(scan, data), range(15), warm_up=1)
         result[f"kjax in a scan, {name}"] = {"us_median": spent / count}
     return result
+
+
+def _on(call: Callable[..., Any], *arguments: Any) -> Call:
+    return lambda _: call(*arguments)
+
+
+def _x_at(call: Callable[..., Any], problems: list[Any]) -> Call:
+    return lambda i: np.asarray(call(*problems[i]))
 
 
 def box_batch(log: dict[str, Any], peers: dict[str, Any], sizes: Any) -> dict[str, Any]:
@@ -256,8 +259,7 @@ def box_batch(log: dict[str, Any], peers: dict[str, Any], sizes: Any) -> dict[st
         pick = rng.choice(len(log["q"]), size)
         host = [log[k][pick] for k in ("mode", "q", "lower", "upper")]
         data = [jnp.asarray(a) for a in host]
-        jax.block_until_ready(batch(*data))
-        ours = _timed(lambda _, data=data: jax.block_until_ready(batch(*data)), range(15))
+        ours = median_us(_on(batch, *data), range(15), warm_up=1)
         entry = {"kjax": ours / size}
         if "daqp" in peers:
 
@@ -265,7 +267,7 @@ def box_batch(log: dict[str, Any], peers: dict[str, Any], sizes: Any) -> dict[st
                 for mode, q, lower, upper in zip(*host, strict=True):
                     solvers[int(mode)](q, lower, upper)
 
-            entry["daqp loop"] = _timed(loop, range(5)) / size
+            entry["daqp loop"] = median_us(loop, range(5)) / size
         result[str(size)] = entry
     return result
 
@@ -276,7 +278,7 @@ def rows_single(problems: list[Any], peers: dict[str, Any], count: int = 300) ->
     solvers: dict[str, Callable[[int], Any]] = {}
     for method in qp.ROW_METHODS:
         call = jax.jit(lambda *p, method=method: qp.solve_rows(*p, method=method).x)
-        solvers[f"kjax {method}"] = lambda i, call=call: np.asarray(call(*problems[i]))
+        solvers[f"kjax {method}"] = _x_at(call, problems)
     n, m = problems[0][2].shape[1], problems[0][2].shape[0]
     clip = [[np.clip(a, -1e30, 1e30) for a in p] for p in problems]
     if "daqp" in peers:
@@ -332,7 +334,7 @@ def rows_single(problems: list[Any], peers: dict[str, Any], count: int = 300) ->
     exact = points["kjax active_set"]
     result = {}
     for name, solve in solvers.items():
-        spent = float(np.median([_timed(solve, ticks) for _ in range(ROUNDS)]))
+        spent = float(np.median([median_us(solve, ticks) for _ in range(ROUNDS)]))
         error = max(np.abs(a - b).max() for a, b in zip(points[name], exact, strict=True))
         result[name] = {"us_median": spent, "apart_from_active_set_max_N": float(error)}
     return result

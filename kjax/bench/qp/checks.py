@@ -3,7 +3,7 @@
 The judges here are plain NumPy and finite differences; nothing of ``kjax.qp`` judges itself.
 """
 
-import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,14 @@ import numpy as np
 from tqdm import tqdm
 
 from kjax import qp
+from kjax.bench.timing import Call, median_us
 
 TOLERANCE = 1e-9
 SIZES = (4, 8, 16, 24, 40, 60)
 TICKS = 64  # problems of a sequence, each warm-started by the one before
 BATCH = 128  # sequences side by side
 WEAK = 1e-4  # margin under which a bound counts as weakly active
+_median_us = partial(median_us, indices=range(40), warm_up=1)
 
 
 # ---------------------------------------------------------------- gradients
@@ -115,31 +117,32 @@ def _sequence(H: Any, q: Any, lower: Any, upper: Any) -> Any:
     prepared = qp.prepare(H)
 
     def tick(warm: Any, row: Any) -> Any:
-        solution = qp.solve(prepared, *row, warm, tolerance=TOLERANCE)
+        q, lower, upper = row
+        solution = qp.solve(prepared, q, lower, upper, warm, tolerance=TOLERANCE)
         return solution.warm, (solution.x, solution.status)
 
     return jax.lax.scan(tick, qp.start(prepared), (q, lower, upper))[1]
 
 
 def _draw(rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
-    """H (B, n, n) and sequences q, lower, upper (B, T, n) that walk; all scales are drawn too."""
+    """H (B, n, n), and q, lower, upper (B, T, n) as random walks; all scales are drawn too."""
     shape = (BATCH, TICKS, n)
     basis = np.linalg.qr(rng.normal(size=(BATCH, n, n)))[0]
     condition = 10.0 ** rng.uniform(0, 8, (BATCH, 1))
     spectrum = condition ** -np.linspace(0, 1, n)
     H = np.einsum("bij,bj,bkj->bik", basis, spectrum, basis)
     H = 0.5 * (H + H.transpose(0, 2, 1))
-    walk = rng.normal(size=shape) * np.where(np.arange(TICKS) > 0, 0.3, 1.0)[:, None]
-    pull = np.cumsum(walk, axis=1)
+    steps = rng.normal(size=shape) * np.where(np.arange(TICKS) > 0, 0.3, 1.0)[:, None]
+    pull = np.cumsum(steps, axis=1)
     # Part of the q pull along stiff directions, part along soft ones: 0 to all bounds active.
     q = np.where(rng.random((BATCH, 1, 1)) < 0.5, pull, np.einsum("bij,btj->bti", H, pull))
     width = 10.0 ** rng.uniform(-3, 2, (BATCH, 1, 1)) * rng.random(shape)
-    centre = rng.normal(size=(BATCH, 1, n)) * width
+    middle = rng.normal(size=(BATCH, 1, n)) * width
     kind = rng.random(shape) if rng.random() < 0.5 else rng.random((BATCH, 1, n))
-    lower = np.where(kind < 0.2, -np.inf, centre - width)
-    upper = np.where((kind > 0.1) & (kind < 0.3), np.inf, centre + width)
+    lower = np.where(kind < 0.2, -np.inf, middle - width)
+    upper = np.where((kind > 0.1) & (kind < 0.3), np.inf, middle + width)
     fixed = kind > 0.9
-    lower, upper = np.where(fixed, centre, lower), np.where(fixed, centre, upper)
+    lower, upper = np.where(fixed, middle, lower), np.where(fixed, middle, upper)
     unit = 2.0 ** rng.integers(-20, 21, (BATCH, 1, n))  # of each variable
     cost = 10.0 ** rng.uniform(-8, 8, (BATCH, 1, 1))  # of the objective
     H = H * cost * unit * unit.transpose(0, 2, 1)
@@ -155,10 +158,10 @@ def independent_residual(
     """
     d = np.diagonal(H, axis1=-2, axis2=-1) ** -0.5
     gradient = d * (np.einsum("...ij,...j->...i", H, x) + q)
-    miss = np.median(np.stack([(x - upper) / d, gradient, (x - lower) / d]), axis=0)
+    residual = np.median(np.stack([(x - upper) / d, gradient, (x - lower) / d]), axis=0)
     size = np.maximum(np.abs(d * q).max(-1), np.abs(x / d).max(-1))
     inside = ((lower <= x) & (x <= upper)).all(-1) & np.isfinite(x).all(-1)
-    return np.where(inside, np.abs(miss).max(-1) / np.where(size > 0, size, 1.0), np.inf)
+    return np.where(inside, np.abs(residual).max(-1) / np.where(size > 0, size, 1.0), np.inf)
 
 
 # ---------------------------------------------------------------- public problems
@@ -190,7 +193,7 @@ def public_problems(folder: Path, peers: dict[str, Any]) -> dict[str, Any]:
         x, y = np.asarray(solution.x), np.asarray(solution.multipliers)
         error = _gap(P, q, C, np.r_[low, lower], np.r_[high, upper], x, y)
         residuals.append(error)
-        ours.append(_median_us(lambda s=solve, a=arguments: np.asarray(s(*a).x)))
+        ours.append(_median_us(_x_of(solve, arguments)))
         if "daqp" in peers:
             theirs.append(_median_us(_by_daqp(P, q, C, low, high, lower, upper)))
     ratio = np.divide(ours, theirs) if theirs else np.array([np.nan])
@@ -202,6 +205,10 @@ def public_problems(folder: Path, peers: dict[str, Any]) -> dict[str, Any]:
         "over_daqp_median": float(np.median(ratio)),
         "over_daqp_max": float(np.max(ratio)),
     }
+
+
+def _x_of(solve: Callable[..., Any], arguments: tuple[Any, ...]) -> Call:
+    return lambda _: np.asarray(solve(*arguments).x)
 
 
 def _as_rows(read: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
@@ -246,19 +253,9 @@ def _by_daqp(
 
     top, bottom = (np.clip(np.r_[a], -1e30, 1e30) for a in ((*upper, *high), (*lower, *low)))
     sense = np.zeros(len(top), np.int32)
-    return lambda: daqp.solve(
+    return lambda _: daqp.solve(
         P, q, np.ascontiguousarray(C), top, bottom, sense, primal_tol=TOLERANCE, dual_tol=TOLERANCE
     )
-
-
-def _median_us(call: Any, repeats: int = 40) -> float:
-    call()
-    times = []
-    for _ in range(repeats):
-        clock = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - clock)
-    return 1e6 * float(np.median(times))
 
 
 # ---------------------------------------------------------------- long horizons
@@ -307,6 +304,9 @@ def riccati_step(steps: int, states: int, inputs: int) -> dict[str, float]:
 
     times = {}
     for name, step in (("riccati, scan", in_sequence), ("riccati, associative", in_parallel)):
-        call = jax.jit(step)
-        times[name] = _median_us(lambda call=call: jax.block_until_ready(call(R)))
+        times[name] = _median_us(partial(_on, jax.jit(step), R))
     return times
+
+
+def _on(call: Callable[[Any], Any], argument: Any, _: int) -> Any:
+    return call(argument)

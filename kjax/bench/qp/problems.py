@@ -15,14 +15,13 @@ from kjax.controllers import planning
 from kjax.controllers.controller import build_controller
 from kjax.controllers.params import condense
 from kjax.controllers.resolve import controller_spec, resolve
-from kjax.mpc import lmpc, multiphase
 from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
 from kjax.sim.resolve import resolve_episode
 
 
 def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list[Any]:
-    """What ``planner`` returns as memory along a walk of the config's own controller."""
+    """What ``planner`` returns as memory along a closed loop of the config's own controller."""
     episode = resolve_episode(config)
     simulation = MujocoEngine(episode.spec)
     controller, model = build_controller(controller_spec(config)), simulation.model
@@ -36,7 +35,7 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
     state, kept = None, []
     steps = round(seconds / config.sim.sim_dt)
     per_tick = round(config.lmpc.control_dt / config.sim.sim_dt)
-    for i in tqdm(range(steps), desc="walking", leave=False, disable=None):
+    for i in tqdm(range(steps), desc="closed loop", leave=False, disable=None):
         seen = simulation.observe(data.qpos, data.qvel, data.sensordata)
         if state is None:
             state = controller.init(tables, seen)
@@ -50,9 +49,9 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
 
 
 def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The box QPs of a walk: prepared Hessians, modes, q and bounds of every tick."""
+    """The box QPs of a closed loop: prepared Hessians, modes, q and bounds of every tick."""
     config = load_config(RunConfig, shipped_config(f"{name}.toml"), changes or {})
-    own = planning.build_planner(controller_spec(config))
+    plan_of = planning.build_planner(controller_spec(config))
 
     def planner(tables: Any, task: Any) -> Any:
         seen: dict[str, Any] = {}
@@ -62,9 +61,10 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
             return real(prepared, q, lower, upper, *args, **options)
 
         real = qp.solve
-        with mock.patch.object(lmpc.qp, "solve", solve):
-            plan = own(tables, task)
-        return plan._replace(memory=(task.mode, seen["q"], seen["lower"], seen["upper"]))
+        with mock.patch.object(qp, "solve", solve):
+            plan = plan_of(tables, task)
+        recorded: Any = (task.mode, seen["q"], seen["lower"], seen["upper"])
+        return plan._replace(memory=recorded)
 
     mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
     hessian = condense(*resolve(config)).lmpc.hessian
@@ -83,7 +83,7 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
 def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
     """The QPs of a bound with a horizon through flight: arguments of ``qp.solve_rows``."""
     config = load_config(RunConfig, shipped_config("bound_multiphase.toml"), {})
-    own = planning.build_planner(controller_spec(config))
+    plan_of = planning.build_planner(controller_spec(config))
 
     def planner(tables: Any, task: Any) -> Any:
         seen: list[Any] = []
@@ -95,10 +95,10 @@ def record_rows(seconds: float) -> list[tuple[np.ndarray, ...]]:
         real = qp.solve_rows
         # The planner holds both horizons behind a cond, whose tracers may not leave it.
         with (
-            mock.patch.object(multiphase.qp, "solve_rows", solve),
-            mock.patch.object(planning.jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
+            mock.patch.object(qp, "solve_rows", solve),
+            mock.patch.object(jax.lax, "cond", lambda _, yes, no, *args: yes(*args)),
         ):
-            plan = own(tables, task)
+            plan = plan_of(tables, task)
         return plan._replace(memory=seen[0])
 
     kept = _drive(config, planner, seconds)

@@ -46,20 +46,9 @@ class Problems(NamedTuple):
 
 def draw(rng: np.random.Generator, kind: str, count: int, n: int, m: int) -> Problems:
     """A batch of one kind; rank of H, activity, repeated rows and all units are drawn as well."""
-    definite = kind == "box"
     C = rng.normal(size=(count, m, n)) * (rng.random((count, m, n)) < 0.7)
     x = rng.normal(size=(count, n)) * 10.0 ** rng.uniform(-2, 2, (count, 1))
-    # Rank and condition, and the scale of H against the multipliers and the box.
-    basis = np.linalg.qr(rng.normal(size=(count, n, n)))[0]
-    rank = np.full((count, 1), n) if definite else rng.integers(0, n + 1, (count, 1))
-    rank = np.where(rng.random((count, 1)) < 0.4, n, rank)
-    if kind == "linear":
-        rank = np.zeros_like(rank)
-    spread = 10.0 ** -(rng.uniform(0, 6, (count, 1)) * np.linspace(0, 1, n))
-    spectrum = np.where(np.arange(n) < rank, spread, 0.0)
-    H = np.einsum("bij,bj,bkj->bik", basis, spectrum, basis)
-    H = 0.5 * (H + H.transpose(0, 2, 1)) * 10.0 ** rng.uniform(-14, 14, (count, 1, 1))
-    H[rank[:, 0] == 0] = 0.0
+    H, rank = _hessian(rng, kind, count, n)
     if kind == "unbounded":
         H, down = _exactly_singular(rng, rank[:, 0], n)
 
@@ -110,24 +99,55 @@ def draw(rng: np.random.Generator, kind: str, count: int, n: int, m: int) -> Pro
     if kind == "infeasible":
         C, low, high = _contradict(rng, C, low, high, m, fixed, x)
         wanted = qp.Status.INFEASIBLE
-        M = m + n
 
-    # Units: of every variable, every row and the cost.
+    data, x, y, unit = _scaled(rng, (H, q, C, low, high), x, y)
+    if kind == "infeasible":
+        y = y * 0.0
+    terms = _terms(data, x, y)
+    least = _cost(data[0], data[1], x) if wanted == qp.Status.SOLVED else np.full(count, np.nan)
+    return Problems(data, unit, least, terms, wanted)
+
+
+def _hessian(
+    rng: np.random.Generator, kind: str, count: int, n: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """H (B, n, n) and its rank (B, 1); condition and scale against the rest are drawn as well."""
+    basis = np.linalg.qr(rng.normal(size=(count, n, n)))[0]
+    rank = np.full((count, 1), n) if kind == "box" else rng.integers(0, n + 1, (count, 1))
+    rank = np.where(rng.random((count, 1)) < 0.4, n, rank)
+    if kind == "linear":
+        rank = np.zeros_like(rank)
+    spread = 10.0 ** -(rng.uniform(0, 6, (count, 1)) * np.linspace(0, 1, n))
+    spectrum = np.where(np.arange(n) < rank, spread, 0.0)
+    H = np.einsum("bij,bj,bkj->bik", basis, spectrum, basis)
+    H = 0.5 * (H + H.transpose(0, 2, 1)) * 10.0 ** rng.uniform(-14, 14, (count, 1, 1))
+    H[rank[:, 0] == 0] = 0.0
+    return H, rank
+
+
+def _scaled(
+    rng: np.random.Generator, problem: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray
+) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    """Problem, point and multipliers in random units of variables, rows and cost; the units (B, n).
+
+    Args:
+      rng: of the units.
+      problem: H, q, C, and the lower and upper bounds (B, m + n) of rows and variables.
+      x: (B, n).
+      y: (B, m + n).
+    """
+    H, q, C, low, high = problem
+    count, m, n = C.shape
     unit = 2.0 ** np.where(rng.random((count, 1)) < 0.5, rng.integers(-10, 11, (count, n)), 0)
-    row = 2.0 ** rng.integers(-5, 6, (count, M - n))
+    row = 2.0 ** rng.integers(-5, 6, (count, m))
     cost = 2.0 ** rng.integers(-26, 27, (count, 1))
     H = H * cost[..., None] / unit[:, :, None] / unit[:, None]
     q, x = q * cost / unit, x * unit
     C = C * row[..., None] / unit[:, None]
-    rows = slice(0, M - n)
     data = (
-        H, q, C, low[:, rows] * row, high[:, rows] * row,
-        low[:, M - n :] * unit, high[:, M - n :] * unit,
+        H, q, C, low[:, :m] * row, high[:, :m] * row, low[:, m:] * unit, high[:, m:] * unit,
     )  # fmt: skip
-    y = y * cost / np.concatenate([row, unit], axis=1) if kind != "infeasible" else y * 0.0
-    terms = _terms(data, x, y)
-    least = _cost(H, q, x) if wanted == qp.Status.SOLVED else np.full(count, np.nan)
-    return Problems(data, unit, least, terms, wanted)
+    return data, x, y * cost / np.concatenate([row, unit], axis=1), unit
 
 
 def _exactly_singular(
@@ -221,7 +241,7 @@ def linear_program_cost(data: tuple[np.ndarray, ...]) -> float | None:
     return float(found.fun) if found.status == 0 else None
 
 
-def _box_solver(method: str) -> Any:
+def _box_solver(method: qp.Method) -> Any:
     """A compiled function of a batch: x and status. Its rows have no members."""
 
     def solve(H: Any, q: Any, C: Any, a: Any, b: Any, lower: Any, upper: Any) -> Any:
@@ -232,7 +252,7 @@ def _box_solver(method: str) -> Any:
     return jax.jit(jax.vmap(solve))
 
 
-def _row_solver(method: str) -> Any:
+def _row_solver(method: qp.RowMethod) -> Any:
     def solve(*data: Any) -> Any:
         found = qp.solve_rows(*data, method=method, tolerance=TOLERANCE)
         return found.x, found.status

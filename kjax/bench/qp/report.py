@@ -5,31 +5,42 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 
+from kjax.viz.tables import markdown_table
+
 
 def table(result: dict[str, Any]) -> str:
     """All of it as Markdown."""
-    lines = ["| single call from Python, 24 variables | trot [us] | bound [us] | "
-             "largest force error [N] |", "|---|---|---|---|"]  # fmt: skip
     trot, bound = result["box"]["trot_velocity"], result["box"]["bound_velocity"]
-    for name, entry in trot.items():
-        error = max(e.get("force_error_max_N", 0.0) for e in (entry, bound[name]))
-        lines.append(
-            f"| {name} | {entry['us_median']:.1f} | {bound[name]['us_median']:.1f} | {error:.1e} |"
-        )
-    lines += ["", "| batch | " + " | ".join(result["batch"]["trot_velocity"]) + " |"]
-    lines.append("|---" * (1 + len(result["batch"]["trot_velocity"])) + "|")
-    for gait, batches in result["batch"].items():
-        for solver in next(iter(batches.values())):
-            cells = " | ".join(f"{entry[solver]:.1f}" for entry in batches.values())
-            lines.append(f"| {gait}, {solver}, us per problem | {cells} |")
-    lines += ["", "| rows: bound with a horizon through flight, 30 variables | us | "
-              "apart from active_set [N] |", "|---|---|---|"]  # fmt: skip
-    for name, entry in result["rows"].items():
-        apart = entry["apart_from_active_set_max_N"]
-        lines.append(f"| {name} | {entry['us_median']:.0f} | {apart:.1e} |")
+    single = markdown_table(
+        ("single call from Python, 24 variables", "trot [us]", "bound [us]",
+         "largest force error [N]"),
+        (
+            (name, f"{entry['us_median']:.1f}", f"{bound[name]['us_median']:.1f}",
+             f"{max(e.get('force_error_max_N', 0.0) for e in (entry, bound[name])):.1e}")
+            for name, entry in trot.items()
+        ),
+    )  # fmt: skip
+    batch = markdown_table(
+        ("batch", *result["batch"]["trot_velocity"]),
+        (
+            (f"{gait}, {solver}, us per problem", *(f"{e[solver]:.1f}" for e in batches.values()))
+            for gait, batches in result["batch"].items()
+            for solver in next(iter(batches.values()))
+        ),
+    )
+    rows = markdown_table(
+        ("rows: bound with a horizon through flight, 30 variables", "us",
+         "apart from active_set [N]"),
+        (
+            (name, f"{e['us_median']:.0f}", f"{e['apart_from_active_set_max_N']:.1e}")
+            for name, e in result["rows"].items()
+        ),
+    )  # fmt: skip
     checks = result["random"]
-    lines += [
-        "",
+    lines = [
+        single,
+        batch,
+        rows,
         f"{checks['solves']:,} random solves, warm-started: {checks['wrong_solved']} wrong, "
         f"{checks['iteration_limit']} at the iteration limit, {checks['other_status']} refused.",
     ]

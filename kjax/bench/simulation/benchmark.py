@@ -5,7 +5,6 @@ import dataclasses
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,9 @@ import jax
 import mujoco.batch
 import numpy as np
 
+from kjax.bench.machine import cores, peak_memory, two_process_speedup
 from kjax.bench.simulation import report
+from kjax.bench.timing import Call, elapsed, interleaved, median_ratio, reported
 from kjax.config import RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.robots import get_robot
@@ -32,10 +33,10 @@ from kjax.sim.resolve import batch_spec, resolve_episode, resolve_episodes
 
 BATCHES = (16, 128, 1024)
 MJX_BATCHES = (16, 128, 1024)
-ENGINE_CASES = 64  # walked by both engines
+ENGINE_CASES = 64  # episodes of both engines
 ROUNDS = 5  # of closed loop and bare engine in turn; medians of each, and of their ratios
-WALK = 0.5  # s of walking that is timed in C
-WALK_MJX = 0.25
+EPISODE = 0.5  # s of closed loop that are timed in C
+EPISODE_MJX = 0.25
 
 
 def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
@@ -44,7 +45,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", False)
     batches = BATCHES[:3] if quick else BATCHES
     rounds = 2 if quick else ROUNDS
-    result: dict[str, Any] = {"threads": len(_cores()), "c": {}, "mjx": {}}
+    result: dict[str, Any] = {"threads": len(cores()), "c": {}, "mjx": {}}
     for gait, torques in (("trot", "held"), ("trot", "every_step"), ("bound", "held")):
         sizes = batches if (gait, torques) == ("trot", "held") else batches[-1:]
         for size in sizes:
@@ -62,7 +63,7 @@ def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     if not quick:
         result |= elsewhere("engines_agree()")
         result |= mjx_compile_times()
-        result["machine_two_process_speedup"] = machine_speedup()
+        result["machine_two_process_speedup"] = two_process_speedup()
         result |= two_processes(folder)
     result |= headline(result)
     (folder / "table.md").write_text(report.table(result), encoding="utf-8")
@@ -103,27 +104,28 @@ def cases(gait: str, count: int, seconds: float) -> list[RunConfig]:
 
 def c_batch(gait: str, torques: Any, size: int, rounds: int) -> dict[str, float]:
     """Closed loop, and the bare engine on the torques of that loop, in turn."""
-    seconds = WALK if size >= 1024 else 2.0 * WALK
+    seconds = EPISODE if size >= 1024 else 2.0 * EPISODE
     episodes = resolve_episodes(cases(gait, size, seconds))
     spec = episodes[0].spec
     engine = BatchEngine(spec, torques=torques)
     recording = engine.run(episodes)  # compiles
     bare = bare_batch(engine, episodes, recording.torque, torques)
     steps, per_tick = size * round(seconds / spec.scene.sim_dt), spec.per_tick
-    walked = int(recording.ticks.sum()) * per_tick  # fewer steps where a robot fell
-    closed_times, bare_times = [], []
-    for _ in range(rounds):
-        closed_times.append(engine.run(episodes).wall_time)
-        bare_times.append(bare())
-    ratios = np.array(bare_times) / np.array(closed_times) * walked / steps
+    completed = int(recording.ticks.sum()) * per_tick  # fewer steps where a robot fell
+    calls: dict[str, Call] = {
+        "closed": lambda _: engine.run(episodes).wall_time,
+        "bare": lambda _: bare(),
+    }
+    times = interleaved(calls, rounds, warm_up=0, measure=reported)
+    ratios = times["bare"] / times["closed"] * completed / steps
     return {
-        "robot_steps_per_s": walked / float(np.median(closed_times)),
-        "bare_robot_steps_per_s": steps / float(np.median(bare_times)),
+        "robot_steps_per_s": completed / float(np.median(times["closed"])),
+        "bare_robot_steps_per_s": steps / float(np.median(times["bare"])),
         "over_bare": float(np.median(ratios)),
         "over_bare_min": float(ratios.min()),
         "over_bare_max": float(ratios.max()),
         "falls": int(recording.fell.sum()),
-        "resident_MB": _resident(),
+        "resident_MB": peak_memory(),
     }
 
 
@@ -173,7 +175,7 @@ def python_loop(seconds: float) -> dict[str, float]:
 
 def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     """Closed loop on MJX, and ``mjx.step`` in a scan with torques held, in turn."""
-    episodes = resolve_episodes(cases("trot", size, WALK_MJX))
+    episodes = resolve_episodes(cases("trot", size, EPISODE_MJX))
     spec = episodes[0].spec
     engine = MjxEngine(spec)
     clock = time.perf_counter()
@@ -181,7 +183,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     first = time.perf_counter() - clock
     robot = get_robot(spec.scene.robot)
     model = mjx.put_model(scene_models(robot, engine.model, episodes[:1])[0])
-    steps, per_tick = round(WALK_MJX / spec.scene.sim_dt), spec.per_tick
+    steps, per_tick = round(EPISODE_MJX / spec.scene.sim_dt), spec.per_tick
     at = find_addresses(robot, engine.model)
     order = np.argsort(at.actuator.reshape(-1))
 
@@ -190,7 +192,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
         data = data.replace(qpos=data.qpos.at[:].set(qpos), qvel=data.qvel.at[:].set(qvel))
         return mjx.forward(model, data)
 
-    def walk(data: Any, torque: Any) -> Any:
+    def rollout(data: Any, torque: Any) -> Any:
         def tick(data: Any, row: Any) -> Any:
             def step(data: Any, _: None) -> Any:
                 stepped = mjx.step(model, data.replace(ctrl=row))
@@ -203,24 +205,22 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     starts = [initial_state(one.start, engine.model, at) for one in episodes]
     qpos, qvel = (np.stack(a) for a in zip(*starts, strict=True))
     data = jax.jit(jax.vmap(begin))(qpos, qvel)
-    bare = jax.jit(jax.vmap(walk, (0, 1)))
+    bare = jax.jit(jax.vmap(rollout, (0, 1)))
     torque = recording.torque[: len(recording.qpos)][..., order]
     jax.block_until_ready(bare(data, torque))
-    closed_times, bare_times = [], []
-    for _ in range(rounds):
-        closed_times.append(engine.run(episodes).wall_time)
-        clock = time.perf_counter()
-        jax.block_until_ready(bare(data, torque))
-        bare_times.append(time.perf_counter() - clock)
-    ratios = np.array(bare_times) / np.array(closed_times)
+    calls: dict[str, Call] = {
+        "closed": lambda _: engine.run(episodes).wall_time,
+        "bare": lambda _: elapsed(bare, data, torque),
+    }
+    times = interleaved(calls, rounds, warm_up=0, measure=reported)
     return {
-        "robot_steps_per_s": size * steps / float(np.median(closed_times)),
-        "bare_robot_steps_per_s": size * steps / float(np.median(bare_times)),
-        "over_bare": float(np.median(ratios)),
-        "compile_s": first - float(np.median(closed_times)),
+        "robot_steps_per_s": size * steps / float(np.median(times["closed"])),
+        "bare_robot_steps_per_s": size * steps / float(np.median(times["bare"])),
+        "over_bare": median_ratio(times["bare"], times["closed"]),
+        "compile_s": first - float(np.median(times["closed"])),
         "traces": engine.traces,
         "falls": int(recording.fell.sum()),
-        "resident_MB": _resident(),
+        "resident_MB": peak_memory(),
     }
 
 
@@ -307,24 +307,10 @@ def mjx_compile_times() -> dict[str, float]:
     return {"mjx_compile_s_cold": times[0], "mjx_compile_s_cached": times[1]}
 
 
-def machine_speedup() -> float:
-    """What two processes that share nothing gain over one: the most that can be had here."""
-    code = "x = 0\nfor i in range(20_000_000): x += i * i"
-
-    def once(count: int) -> float:
-        clock = time.perf_counter()
-        running = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(count)]
-        for process in running:
-            process.wait()
-        return (time.perf_counter() - clock) / count
-
-    return float(np.median([once(1) / once(2) for _ in range(3)]))
-
-
 def two_processes(folder: Path) -> dict[str, float]:
     """A sweep on two processes of one thread each beside one, both compiled before.
 
-    The speedup is that of walking: the sum of both rates over the rate of one, without each
+    The speedup is that of the episodes: the sum of both rates over the rate of one, without each
     process's first chunk, which loads the program. ``..._whole`` is that of the whole command, the
     start of which, some 15 s, does not get shorter.
     """
@@ -349,7 +335,7 @@ def two_processes(folder: Path) -> dict[str, float]:
                 "--coordinator", "127.0.0.1:12355", "--processes", str(count),
                 "--process", str(number),
             ]  # fmt: skip
-            pin = ["taskset", "-c", str(_cores()[number % len(_cores())])]
+            pin = ["taskset", "-c", str(cores()[number % len(cores())])]
             running.append(
                 subprocess.Popen(
                     [*pin, *common, *more, "--out", str(out)],
@@ -360,18 +346,9 @@ def two_processes(folder: Path) -> dict[str, float]:
         if any(process.returncode for process in running):
             raise RuntimeError("\n".join(texts))
         rates = [re.findall(r"([0-9.]+) k robot-steps/s", text)[1:] for text in texts]
-        walking = sum(float(np.median([float(r) for r in own])) for own in rates if own)
-        return time.perf_counter() - clock, walking
+        rate = sum(float(np.median([float(r) for r in own])) for own in rates if own)
+        return time.perf_counter() - clock, rate
 
     once(1, "--seeds", "64")
     (alone, one), (together, two) = once(1), once(2)
     return {"two_process_speedup": two / one, "two_process_speedup_whole": alone / together}
-
-
-def _cores() -> list[int]:
-    return sorted(os.sched_getaffinity(0))
-
-
-def _resident() -> float:
-    """Largest resident memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

@@ -5,24 +5,23 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 
+from kjax.viz.tables import markdown_table
+
 
 def table(result: dict[str, Any]) -> str:
     """All of it as Markdown."""
-    lines = [
-        "| engine, gait, torques, robots | robot-steps/s | bare engine | part of it | memory, MB |",
-        "|---|---|---|---|---|",
-    ]
-    rows = [(f"C, {name}", entry) for name, entry in result["c"].items()]
-    rows += [(f"MJX, trot, every_step, {name}", entry) for name, entry in result["mjx"].items()]
-    for name, entry in rows:
-        lines.append(
-            f"| {name} | {entry['robot_steps_per_s']:,.0f} | "
-            f"{entry['bare_robot_steps_per_s']:,.0f} | {entry['over_bare']:.2f} | "
-            f"{entry['resident_MB']:,.0f} |"
-        )
+    entries = [(f"C, {name}", entry) for name, entry in result["c"].items()]
+    entries += [(f"MJX, trot, every_step, {name}", entry) for name, entry in result["mjx"].items()]
+    rows = [
+        (name, f"{entry['robot_steps_per_s']:,.0f}", f"{entry['bare_robot_steps_per_s']:,.0f}",
+         f"{entry['over_bare']:.2f}", f"{entry['resident_MB']:,.0f}")
+        for name, entry in entries
+    ]  # fmt: skip
     alone = result["python_loop"]["robot_steps_per_s"]
-    lines.append(f"| C, trot, every step, one robot in a Python loop | {alone:,.0f} | | | |")
-    return "\n".join(lines) + "\n"
+    rows.append(("C, trot, every step, one robot in a Python loop", f"{alone:,.0f}", "", "", ""))
+    header = ("engine, gait, torques, robots", "robot-steps/s", "bare engine", "part of it",
+              "memory, MB")  # fmt: skip
+    return markdown_table(header, rows)
 
 
 def figure(result: dict[str, Any], path: Path) -> None:

@@ -1,1 +1,1 @@
-"""What the paper publishes, beside our numbers and targets."""
+"""What the paper publishes, beside our results and targets."""

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from kjax.viz.tables import markdown_table
+
 LABELS = {
     "nominal": "rigid body, feet planted",
     "affine": "+ affine residual",
-    "clock_history": "+ place in the phase, last force",
+    "clock_history": "+ phase clock, last force",
     "touchdown": "+ ticks around a touchdown",
 }
 
@@ -36,13 +38,12 @@ def compact(entry: dict[str, Any]) -> dict[str, Any]:
 def table(families: dict[str, Any]) -> str:
     """Rms errors of every model inside a stance, as Markdown."""
     horizons = list(next(iter(next(iter(families.values())).values())))
-    heads = [f"{gait}, {name}" for gait in families for name in horizons]
-    lines = [
-        "| inside a stance of the whole robot, as an LMPC predicts | "
-        + " | ".join(f"{head}: velocity [m/s], ratio; pitch rate [rad/s], ratio" for head in heads)
-        + " |",
-        "|---" * (1 + len(heads)) + "|",
+    heads = [
+        f"{gait}, {name}: velocity [m/s], ratio; pitch rate [rad/s], ratio"
+        for gait in families
+        for name in horizons
     ]
+    rows = []
     for label in next(iter(families.values())):
         cells = []
         for models in families.values():
@@ -52,9 +53,10 @@ def table(families: dict[str, Any]) -> str:
                     f"{e['rms']:.3f}, {e['ratio']:.2f} ({e['interval'][0]:.2f} to "
                     f"{e['interval'][1]:.2f})" for e in (entry["velocity"], entry["omega"])
                 ))  # fmt: skip
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    lines.append("\nRatio: to the error of the planted rigid body, integrated, not linearised.")
-    return "\n".join(lines) + "\n"
+        rows.append([label, *cells])
+    header = ["inside a stance of the whole robot, as an LMPC predicts", *heads]
+    note = "Ratio: to the error of the planted rigid body, integrated, not linearised.\n"
+    return f"{markdown_table(header, rows)}\n{note}"
 
 
 def show(gait: str, where: str, table: dict[str, Any]) -> None:
@@ -80,8 +82,9 @@ def save_figure(curves: dict[str, Any], dt: float, path: Path) -> None:
 
     Over all start points the predictions follow the schedule, but for the dashed one.
     """
+    import matplotlib.pyplot as plt
+
     from kjax.viz import plots
-    from kjax.viz.plots import plt
 
     colours = {"nominal": plots.DARK, "affine": plots.BLUE, "clock_history": "#2f855a",
                "touchdown": plots.RED}  # fmt: skip

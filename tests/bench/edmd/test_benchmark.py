@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.bench.edmd import benchmark, peers, stream
+from kjax.bench.edmd import benchmark, peers, report, stream
 from kjax.bench.edmd import data as drawing
 from kjax.dynamics import srb_planar
 from kjax.koopman import edmd, observables
@@ -167,12 +167,12 @@ def test_figures_are_none_where_the_peer_is_absent(tmp_path):
     assert found["rollouts_over_vectorised_numpy"] == 2.0
     assert found["fit_over_pykoopman"] is found["fit_over_pykoop"] is None
     assert found["fits100_speedup"] is found["fits100_speedup_lifted_once"] is None
-    assert "Not measured: pykoopman, pykoop." in benchmark.table(result)
+    assert "Not measured: pykoopman, pykoop." in report.table(result)
     for key in benchmark.KEYS:
         fits[key] |= {"pykoopman": 8.0, "pykoop": 6.0}
     found = benchmark.summary(result)
     assert (found["fit_over_pykoopman"], found["fits100_speedup"]) == (0.25, 3.0)
-    benchmark.figure(result, tmp_path / "figure.png")
+    report.figure(result, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 

@@ -1,6 +1,7 @@
-"""Sweeps with a stand-in for the engine: chunks, resuming, refusals; and a real one, killed."""
+"""Sweeps with a stand-in for the engine: chunks, resuming, refusals, kills."""
 
 import dataclasses
+import os
 import shutil
 import signal
 import socket
@@ -229,38 +230,58 @@ def test_chunks_do_not_mix_what_cannot_walk_together(file):
     assert [len(chunk.configs) for chunk in made] == [4, 4, 4, 3]
 
 
+# A sweep whose engine is a stand-in that takes its time over a chunk.
+STUB = """
+import time
+from types import SimpleNamespace
+from kjax import cli
+from kjax.runs.sweeps import runner
+from kjax.studies.sweep import main
+
+class Engine:
+    def run(self, configs, on_progress):
+        time.sleep(0.1)
+        rows = [{"fell": False, "velocity_rmse_mps": c.seed + c.command.v_x[0]} for c in configs]
+        return SimpleNamespace(interrupted=False, metrics=lambda: iter(rows))
+
+runner.build_engine = lambda sweep, config, threads: Engine()
+if __name__ == "__main__":
+    cli.run(main)
+"""
+
+
 @pytest.mark.slow
 def test_a_sweep_killed_three_times_equals_one_that_was_not(file, tmp_path, repository):
-    """The real engine, in processes that are killed without warning."""
-    script = repository / "experiments" / "sweep.py"
+    """Processes that are killed without warning, while a chunk is walked or kept."""
+    script = tmp_path / "stub.py"
+    script.write_text(STUB)
     file.write_text(SWEEP.replace("seeds = 5", "seeds = 16").replace("chunk = 4", "chunk = 2"))
+    environment = {**os.environ, "PYTHONPATH": str(repository)}
 
-    def start(folder):
+    def start():
         return subprocess.Popen(
-            [sys.executable, str(script), str(file), "--threads", "1", "--out", str(folder)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            [sys.executable, str(script), str(file), "--out", str(tmp_path / "out")],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment,
         )  # fmt: skip
 
-    whole = start(tmp_path / "whole")
-    text, _ = whole.communicate(timeout=300)
-    assert whole.returncode == 0, text
+    chunks = tmp_path / "out" / "cache"
     for kill in (3, 6, 9):
-        process = start(tmp_path / "out")
-        chunks = tmp_path / "out" / "cache"
+        process = start()
         while process.poll() is None and len(list(chunks.glob("*.json"))) < kill:
             time.sleep(0.02)
         process.send_signal(signal.SIGKILL)
-        process.communicate()
+        text, _ = process.communicate()
+        assert process.returncode == -signal.SIGKILL, text
     assert 9 <= len(list(chunks.glob("*.json"))) < 16
-    last = start(tmp_path / "out")
+    last = start()
     text, _ = last.communicate(timeout=300)
     assert last.returncode == 0, text
     assert "chunks are there already" in text
-    with (
-        xr.open_dataset(tmp_path / "whole" / "sweep.nc") as one,
-        xr.open_dataset(tmp_path / "out" / "sweep.nc") as other,
-    ):
-        xr.testing.assert_equal(one.drop_attrs(), other.drop_attrs())
+    with xr.open_dataset(tmp_path / "out" / "sweep.nc") as data:
+        expected = data["seed"] + data["speed"]  # as the stand-in has it
+        xr.testing.assert_equal(data["velocity_rmse_mps"].drop_attrs(),
+                                expected.transpose("speed", "seed"))  # fmt: skip
+        assert not data["fell"].any()
 
 
 @pytest.mark.slow

@@ -2,9 +2,9 @@
 
 Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body on legs
 without mass, the controller's own plan, 200 QPs a second), with others held out. With --baseline
-CMA-ES (pycma) tunes the same numbers in MuJoCo itself, for the same wall time; with --refine it
-goes on from the descent's result. All results, the start and the config's own numbers then walk the
-config's whole command in MuJoCo on other seeds.
+CMA-ES (pycma) tunes the same parameters in MuJoCo itself, for the same wall time; with --refine it
+goes on from the descent's result. All results, the start and the config's own parameters then run
+the config's whole command in MuJoCo on other seeds.
 
 Leaves tuned.toml, metrics.json, table.md and figure.png in the output folder. The state is kept
 there as well: the same command goes on after Ctrl-C or a kill.
@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
 from tqdm import tqdm
 
@@ -30,8 +29,9 @@ from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.resolve import batch_spec, resolve_episodes
 from kjax.sim.summary import summarise
+from kjax.studies.tune import report
 from kjax.tuning import loop
-from kjax.tuning.optimise import build_objective, descend
+from kjax.tuning.optimise import Descent, build_objective, descend
 from kjax.tuning.space import TUNABLE, Space, Variables, build_space, shown, tuned_config
 
 TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
@@ -70,22 +70,9 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     objective = build_objective(short, space, memory=args.memory)
     look = jax.jit(lambda z: jax.vmap(objective, (None, 0))(z, held_out).mean())
     own_cost, begin_cost = float(look(space.start)), float(look(begin))
-    print(f"cost on {args.held_out} held-out scenarios: the config's own numbers {own_cost:.3f}, "
+    print(f"cost on {args.held_out} held-out scenarios: the config's own {own_cost:.3f}, "
           f"the start {begin_cost:.3f}", flush=True)  # fmt: skip
-    with tqdm(total=args.updates, unit="update", disable=None) as bar:
-
-        def show(number: int, value: float, best: float) -> None:
-            bar.n = number
-            bar.set_postfix_str(f"cost {value:.3f}, held out {best:.3f}")
-
-        try:
-            result = descend(
-                objective, space, train, held_out, start=begin, updates=args.updates,
-                rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
-                checkpoint=cache.path(key, ".npz"), identity=key, on_update=show,
-            )  # fmt: skip
-        except ValueError as error:
-            cli.fail(str(error))
+    result = _descend(objective, space, (train, held_out), begin, args, cache.path(key, ".npz"))
     print(f"descent: {len(result.cost)} updates in {result.seconds:.0f} s, held-out cost "
           f"{result.best_cost:.3f} after update {result.best_update} (ended by: {result.stopped})",
           flush=True)  # fmt: skip
@@ -99,16 +86,69 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
               f"{searches[name]['population']} in MuJoCo in {searches[name]['seconds']:.0f} s",
               flush=True)  # fmt: skip
     costs = {name: float(look(z)) for name, z in sets.items()}
-    verdict = {name: walk(config, space.overrides(z), args.seeds) for name, z in sets.items()}
+    verdict = {name: verdict_of(config, space.overrides(z), args.seeds) for name, z in sets.items()}
     cli.save_config(folder / "tuned.toml", tuned_config(config, space.overrides(result.best)))
     record = {
+        **_record(args, result, searches),
+        "held_out_cost": costs,
+        "cost_over_own": {name: value / costs["own"] for name, value in costs.items()},
+        "values": {name: space.overrides(z) for name, z in sets.items()},
+        "mujoco": verdict,
+    }
+    cli.save_json(folder / "metrics.json", record)
+    text = report.table(record)
+    (folder / "table.md").write_text(text, encoding="utf-8")
+    runs = traces(short, space, sets, held_out)
+    report.figure(record, runs, short, folder / "figure.png")
+    print(text)
+    print(f"results in {folder}/")
+    if not result.healthy:
+        cli.fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
+
+
+def _descend(
+    objective: Any,
+    space: Space,
+    scenarios: tuple[loop.Scenario, loop.Scenario],
+    begin: Variables,
+    args: Namespace,
+    checkpoint: Path,
+) -> Descent:
+    """The descent on the training scenarios, with a bar of its progress; kept as it goes.
+
+    Args:
+      objective: cost of variables on a scenario.
+      space: of the variables.
+      scenarios: to descend on, and held out.
+      begin: where it starts.
+      args: of the command line.
+      checkpoint: file that it is kept in, named by the key of all that it depends on.
+    """
+    with tqdm(total=args.updates, unit="update", disable=None) as bar:
+
+        def show(number: int, value: float, best: float) -> None:
+            bar.n = number
+            bar.set_postfix_str(f"cost {value:.3f}, held out {best:.3f}")
+
+        try:
+            return descend(
+                objective, space, *scenarios, start=begin, updates=args.updates,
+                rate=args.rate, patience=args.patience, seconds=60.0 * args.minutes,
+                checkpoint=checkpoint, identity=checkpoint.stem, on_update=show,
+            )  # fmt: skip
+        except ValueError as error:
+            cli.fail(str(error))
+
+
+def _record(
+    args: Namespace, result: Descent, searches: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """What metrics.json says of how the parameters were found."""
+    return {
         "provenance": cli.provenance(),
         "keys": list(args.keys),
         "worsen": args.worsen,
         "scenarios": {"train": args.scenarios, "held_out": args.held_out, "seconds": args.seconds},
-        "held_out_cost": costs,
-        "cost_over_own": {name: value / costs["own"] for name, value in costs.items()},
-        "values": {name: space.overrides(z) for name, z in sets.items()},
         "descent": {
             "updates": len(result.cost), "seconds": result.seconds, "stopped": result.stopped,
             "best_update": result.best_update, "cost": result.cost,
@@ -118,17 +158,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
             name: {k: v for k, v in found.items() if k != "best"}
             for name, found in searches.items()
         },
-        "mujoco": verdict,
     }  # fmt: skip
-    cli.save_json(folder / "metrics.json", record)
-    text = table(record)
-    (folder / "table.md").write_text(text, encoding="utf-8")
-    runs = traces(short, space, sets, held_out)
-    figure(record, runs, short, folder / "figure.png")
-    print(text)
-    print(f"results in {folder}/")
-    if not result.healthy:
-        cli.fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
 
 
 def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
@@ -152,7 +182,7 @@ def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
         type=float,
         default=1.0,
         metavar="FACTOR",
-        help="begin with every number off by this factor, up or down",
+        help="begin with every parameter off by this factor, up or down",
     )
     parser.add_argument("--worsen-seed", type=int, default=0, help="of which are up, which down")
     parser.add_argument(
@@ -169,9 +199,9 @@ def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
     parser.add_argument(
         "--refine",
         action="store_true",
-        help="CMA-ES in MuJoCo from where the descent ends, likewise",
+        help="CMA-ES in MuJoCo from the descent's result, likewise",
     )
-    parser.add_argument("--seeds", type=int, default=16, help="of the walks in MuJoCo at the end")
+    parser.add_argument("--seeds", type=int, default=16, help="episodes in MuJoCo at the end")
     config, args = cli.parse(RunConfig, parser, argv)
     args.speeds = min(config.command.v_x), max(config.command.v_x)
     for name in ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
@@ -232,7 +262,7 @@ def evolve(
     config: RunConfig, space: Space, begin: Variables, args: Namespace, seconds: float,
     cache: Cache, key: str,
 ) -> dict[str, Any]:  # fmt: skip
-    """CMA-ES on batches of MuJoCo walks for some wall time [s]; kept after every generation.
+    """CMA-ES on batches of MuJoCo episodes for some wall time [s]; kept after every generation.
 
     What is kept is the costs and times of the generations: the search draws the same candidates
     from the same seed, and is told again what they cost.
@@ -257,8 +287,8 @@ def evolve(
             search.tell(search.ask(), row.tolist())
             costs.append(row)
             spent.append(float(seconds_of_it))
-    walks = mujoco_scenarios(config, args)
-    engine = BatchEngine(batch_spec(walks[0]), torques="held")
+    scenarios = mujoco_scenarios(config, args)
+    engine = BatchEngine(batch_spec(scenarios[0]), torques="held")
     with tqdm(total=round(seconds), unit="s", desc="CMA-ES", disable=None) as bar:
         while sum(spent) < seconds and not search.stop():
             clock = time.perf_counter()
@@ -266,11 +296,11 @@ def evolve(
             candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
             recording = engine.run(resolve_episodes([
                 dataclasses.replace(c, command=w.command, seed=w.seed, sim=w.sim)
-                for c in candidates for w in walks
+                for c in candidates for w in scenarios
             ]))  # fmt: skip
             if recording.interrupted:
                 raise KeyboardInterrupt
-            row = recording_costs(recording).reshape(len(asked), len(walks)).mean(axis=1)
+            row = recording_costs(recording).reshape(len(asked), len(scenarios)).mean(axis=1)
             search.tell(asked, row.tolist())
             costs.append(row)
             spent.append(time.perf_counter() - clock)
@@ -281,14 +311,14 @@ def evolve(
         "best": unflat(search.result.xfavorite if costs else mean),
         "generations": len(costs),
         "population": search.popsize,
-        "episodes": len(costs) * search.popsize * len(walks),
+        "episodes": len(costs) * search.popsize * len(scenarios),
         "seconds": sum(spent),
         "cost": [float(one.min()) for one in costs],
     }
 
 
 def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
-    """What a candidate of the baseline walks: the descent's commands, in MuJoCo."""
+    """Episodes of a candidate of the baseline: the descent's commands, in MuJoCo."""
     rng = np.random.default_rng(TRAIN_SEED)
     low, high = args.speeds
     times = tuple(float(i) * args.seconds / args.pieces for i in range(args.pieces))
@@ -305,7 +335,7 @@ def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
     ]
 
 
-def walk(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, Any]:
+def verdict_of(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, Any]:
     """The config's whole command in MuJoCo with some values, torques at every step."""
     chosen = tuned_config(config, overrides)
     configs = [dataclasses.replace(chosen, seed=seed) for seed in range(seeds)]
@@ -327,55 +357,7 @@ def walk(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict[str, 
 def traces(
     config: RunConfig, space: Space, sets: dict[str, Variables], scenarios: loop.Scenario
 ) -> dict[str, Any]:
-    """The first held-out scenario with every set of numbers."""
+    """The first held-out scenario with every set of parameters."""
     run = jax.jit(loop.build_loop(config))
     one = jax.tree.map(lambda a: a[0], scenarios)
     return {name: jax.device_get(run(space.params(z), one)) for name, z in sets.items()}
-
-
-def table(record: dict[str, Any]) -> str:
-    """Markdown."""
-    lines = [
-        "| numbers | held-out cost, rigid body | MuJoCo: fell | RMSE of v_x [m/s] | "
-        "pitch, 95 % [deg] | cost |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, entry in record["mujoco"].items():
-
-        def cell(key: str, entry: dict[str, Any] = entry) -> str:
-            if key not in entry:
-                return "-"
-            return f"{entry[key]['median']:.3g} ({entry[key]['worst']:.3g})"
-
-        lines.append(
-            f"| {name} | {record['held_out_cost'][name]:.3f} | {entry['falls']} of "
-            f"{entry['runs']} | {cell('velocity_rmse_mps')} | {cell('pitch_p95_deg')} | "
-            f"{entry['cost_median']:.3f} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path: Path) -> None:
-    """Loss curve; one held-out scenario before and after."""
-    fig, (curve, speed, pitch) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
-    descent, costs = record["descent"], record["held_out_cost"]
-    curve.plot(descent["cost"], lw=0.8, label="training scenarios")
-    curve.plot(descent["checks"], descent["held_out"], "o-", ms=2.5, label="held out")
-    curve.axhline(costs["own"], color="k", ls="--", lw=0.8, label="config's own numbers")
-    curve.set(xlabel="update of Adam", ylabel="cost [-]", yscale="log")
-    curve.legend(fontsize=7)
-    dt = config.lmpc.control_dt
-    first = next(iter(runs.values()))
-    time_axis = np.arange(len(first.x)) * dt
-    speed.plot(time_axis, first.wanted[:, 0], "k--", lw=0.9, label="reference")
-    for name, run in runs.items():
-        shown = np.where(run.alive[:, None], run.x, np.nan)
-        speed.plot(time_axis, shown[:, 3], lw=0.9, label=name)
-        pitch.plot(time_axis, np.degrees(shown[:, 2]), lw=0.9, label=name)
-    speed.set(xlabel="time [s]", ylabel="v_x [m/s]", title="a held-out scenario, rigid body")
-    pitch.set(xlabel="time [s]", ylabel="pitch [deg]")
-    speed.legend(fontsize=7)
-    for ax in (curve, speed, pitch):
-        ax.grid(alpha=0.3)
-    fig.savefig(path, dpi=120)
-    plt.close(fig)

@@ -1,0 +1,1 @@
+"""The controller tuned by gradients through its closed loop, and the verdict of MuJoCo."""

@@ -1,0 +1,110 @@
+"""The benchmark's entry: verbs, their options, what each leaves."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from kjax.bench import controller, main
+from kjax.bench.main import main as entry
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """Stand in for the module of every verb; its ``seen`` are the options that it got."""
+    module = SimpleNamespace(seen=[])
+
+    def run(folder, args):
+        module.seen.append(args)
+        (folder / "table.md").write_text("| a table |\n")
+        return {"speed": 2.0, "nothing": None}
+
+    def add_arguments(parser):
+        parser.add_argument("--more", type=int, default=1)
+
+    module.run, module.add_arguments = run, add_arguments
+    monkeypatch.setitem(sys.modules, "stand_in", module)
+    for name in main.MODULES:
+        monkeypatch.setitem(main.MODULES, name, "stand_in")
+    return module
+
+
+@pytest.mark.parametrize("verb", ["qp", "simulation", "edmd", "gradient"])
+def test_a_verb_gets_its_options_and_leaves_its_results(stand_in, call, capsys, tmp_path, verb):
+    assert call(entry, verb, "--quick", "--more", 3, "--out", tmp_path) == 0
+    (args,) = stand_in.seen
+    assert (args.quick, args.more) == (True, 3)
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert (found["speed"], found["nothing"]) == (2.0, None)
+    assert "git_revision" in found["provenance"]
+    assert "| a table |" in capsys.readouterr().out
+
+
+def test_the_verbs_are_those_of_the_help(call, capsys):
+    assert call(entry, "-h") == 0
+    text = capsys.readouterr().out
+    assert "{controller,qp,simulation,edmd,gradient}" in text
+    for verb in main.BENCHMARKS:
+        assert f"\n{verb}: " in text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "which benchmark? one of: controller, qp, simulation, edmd, gradient"),
+        (["speed"], "which benchmark?"),
+        (["qp", "--quik"], "--quik"),
+        (["controller", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["controller", "--lmpc.horizn", "3"], "did you mean --lmpc.horizon"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(stand_in, call, capsys, words, said):
+    assert call(entry, *words) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert said in err
+    assert stand_in.seen == []
+
+
+@pytest.mark.parametrize("startup", [True, False])
+def test_the_controller_s_latency_and_unless_left_out_its_start(
+    call, capsys, monkeypatch, tmp_path, repository, startup
+):
+    seen = []
+    monkeypatch.setattr(
+        controller, "controller_latency", lambda config: {"plan_ms_median": config.duration}
+    )
+    monkeypatch.setattr(
+        controller, "start_up", lambda config: seen.append(config) or {"first_run_s": 9.0}
+    )
+    config = str(repository / "configs" / "trot_velocity.toml")
+    words = [config, "--duration", 3, "--out", tmp_path]
+    assert call(entry, "controller", *words, *([] if startup else ["--no-startup"])) == 0
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert found["config"] == config
+    assert found["plan_ms_median"] == 3.0
+    assert ("first_run_s" in found) is startup
+    assert seen == ([config] if startup else [])
+    assert "plan_ms_median" in capsys.readouterr().out
+
+
+def test_a_start_is_timed_with_an_empty_and_then_a_filled_compile_cache(monkeypatch):
+    caches = []
+
+    def run(command, *, env, check, capture_output):
+        assert command[1:4] == ["-m", "kjax.studies.closed_loop", "trot.toml"]
+        folder = command[command.index("--out") + 1]
+        cache = env["JAX_COMPILATION_CACHE_DIR"]
+        caches.append((cache, sorted(controller.Path(folder).parent.glob("cache/*"))))
+        controller.Path(cache).mkdir(exist_ok=True)
+        (controller.Path(cache) / "program").touch()
+        controller.Path(folder).mkdir(exist_ok=True)
+        (controller.Path(folder) / "metrics.json").write_text('{"realtime_factor": 4.0}')
+
+    monkeypatch.setattr(controller.subprocess, "run", run)
+    found = controller.start_up("trot.toml")
+    assert [len(programs) for _, programs in caches] == [0, 1]
+    assert caches[0][0] == caches[1][0]
+    assert found["second_run_realtime_factor"] == 4.0
+    assert min(found["first_run_s"], found["second_run_s"]) > 0.0
