@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from kjax.config import ConfigError, DatasetConfig
 from kjax.koopman import regression
-from kjax.koopman.dataset import Snapshots
+from kjax.koopman.dataset import DatasetSpec, Snapshots
 from kjax.koopman.observables import Dictionary, lift_all
 from kjax.types import INPUT_DIM, INPUT_NAMES, STATE_DIM, STATE_NAMES, STATE_UNITS
 
@@ -108,12 +107,12 @@ def require_rows(rows: int, columns: int) -> None:
         raise ValueError(f"{rows} snapshots are too few for {columns} regressors")
 
 
-def require_dataset(config: DatasetConfig, columns: int) -> None:
-    """Raise a ConfigError for a dataset of fewer snapshots than a fit has regressors."""
-    rows = config.rollouts * round(config.duration / config.dt)
+def require_dataset(dataset: DatasetSpec, columns: int) -> None:
+    """Raise a ValueError for a dataset of fewer snapshots than a fit has regressors."""
+    rows = dataset.rollouts * dataset.steps
     if rows < columns:
-        raise ConfigError(
-            f"koopman.dataset: rollouts {config.rollouts} of duration {config.duration} s give "
+        raise ValueError(
+            f"dataset: rollouts {dataset.rollouts} of duration {dataset.duration} s give "
             f"{rows} snapshots, too few for {columns} regressors"
         )
 

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kjax.config import ConfigError
 from kjax.koopman.models import BilinearModel
 from kjax.prediction.families import Past, Start
 from kjax.prediction.features import BY_NAME
@@ -80,11 +79,13 @@ def load(path: str | Path, family: str) -> Stored:
       family: ``"residual"`` or ``"learned"``.
 
     Raises:
-      ConfigError: in one line that names the file and the fault: not there, not readable, not a
+      ValueError: in one line that names the file and the fault: not there, not readable, not a
         model's, of another family, or with an array that is missing, not real, not finite, or of
         another shape than the family and the other arrays ask for.
     """
     file = resolve(path)
+    if not file.name:
+        raise _fault(file, "is no file")
     arrays = _read(file)
     if family not in ("residual", "learned"):
         raise ValueError(f"family must be 'residual' or 'learned', got {family!r}")
@@ -122,8 +123,11 @@ def load(path: str | Path, family: str) -> Stored:
 
 def resolve(path: str | Path) -> Path:
     """The file that ``load`` reads for a path: the one that ``save`` writes, or the path itself."""
+    path = Path(path)
+    if not path.name:
+        return path
     file = _with_suffix(path)
-    return file if file.exists() else Path(path)
+    return file if file.exists() else path
 
 
 def _with_suffix(path: str | Path) -> Path:
@@ -133,8 +137,8 @@ def _with_suffix(path: str | Path) -> Path:
     return path if path.name.endswith(_SUFFIX) else path.with_name(path.name + _SUFFIX)
 
 
-def _fault(file: Path, text: str) -> ConfigError:
-    return ConfigError(f"koopman.file: '{file}' {text}")
+def _fault(file: Path, text: str) -> ValueError:
+    return ValueError(f"file: '{file}' {text}")
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -149,7 +153,7 @@ def _read(file: Path) -> dict[str, Any]:
         reason = error.strerror or str(error)
     except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
         reason = f"it is empty, cut off, damaged or no .npz ({error})"
-    raise ConfigError(f"koopman.file: cannot read '{file}': {reason.splitlines()[0]}")
+    raise ValueError(f"file: cannot read '{file}': {reason.splitlines()[0]}")
 
 
 def _is_word(value: np.ndarray | None) -> bool:

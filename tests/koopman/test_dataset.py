@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from kjax.config import DatasetConfig
 from kjax.koopman import dataset
+from kjax.koopman.dataset import DatasetSpec
 from kjax.types import MODE_ALPHA, Mode
 
 DT = 1e-3  # s, the step of the shared snapshots
@@ -26,7 +26,7 @@ def sampler(body):
 
 @pytest.fixture(scope="module")
 def ranges():
-    return dataset.ranges_from_config(DatasetConfig(), vary_feet=True)
+    return dataset.sample_ranges(DatasetSpec(), vary_feet=True)
 
 
 def derivative(body, alpha, feet, u, x):
@@ -68,7 +68,7 @@ def test_samples_fill_their_ranges_and_stay_inside(snapshots, snapshots_moving_f
 
 def test_contact_points_stay_put_unless_asked_to_vary(snapshots, body):
     np.testing.assert_array_equal(snapshots.feet, np.broadcast_to(body.feet, (len(Mode), 40, 2, 2)))
-    still = dataset.ranges_from_config(DatasetConfig(), vary_feet=False)
+    still = dataset.sample_ranges(DatasetSpec())
     np.testing.assert_array_equal(still.feet_half, 0.0)
 
 
@@ -98,15 +98,15 @@ def test_each_force_is_held_and_a_last_incomplete_piece_is_cut(sampler, ranges):
     np.testing.assert_array_equal(changes, [False, False, True, False, False, True])
 
 
-def test_ranges_come_from_the_config_in_the_order_of_state_and_input():
-    config = DatasetConfig(
+def test_ranges_come_from_the_spec_in_the_order_of_state_and_input():
+    spec = DatasetSpec(
         height=0.3,
         state_range=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
         force_x=7.0,
         force_z=(8.0, 9.0),
         feet_range=(0.1, 0.2),
     )
-    ranges = dataset.ranges_from_config(config, vary_feet=True)
+    ranges = dataset.sample_ranges(spec, vary_feet=True)
     np.testing.assert_array_equal(ranges.state_centre, [0, 0.3, 0, 0, 0, 0])
     np.testing.assert_array_equal(ranges.state_half, [1, 2, 3, 4, 5, 6])
     np.testing.assert_array_equal(ranges.input_low, [-7, 8, -7, 8])
@@ -133,3 +133,8 @@ def test_a_scan_over_ranges_is_a_vmap(sampler, ranges):
     single = sampler(key, dataset.shrink(ranges, scales[1]))
     # The same operations, fused differently; forces reach 150 N.
     chex.assert_trees_all_close(jax.tree.map(lambda a: a[1], batch), single, rtol=0, atol=1e-11)
+
+
+def test_the_old_name_of_sample_ranges_says_the_new_one():
+    with pytest.raises(ImportError, match="is now sample_ranges"):
+        from kjax.koopman.dataset import ranges_from_config  # noqa: F401
