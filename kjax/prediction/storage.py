@@ -79,7 +79,7 @@ def load(path: str | Path, family: str) -> Stored:
       family: ``"residual"`` or ``"learned"``.
 
     Raises:
-      ValueError: in one line that names the file and the fault: not there, not readable, not a
+      ValueError: in one line that names the file and the fault: missing, unreadable, not a
         model's, of another family, or with an array that is missing, not real, not finite, or of
         another shape than the family and the other arrays ask for.
     """
@@ -172,7 +172,7 @@ def _check_array(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
     if values.shape != shape:
         raise ValueError(f"{name} has shape {values.shape}, wanted {shape}")
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds numbers that are not finite")
+        raise ValueError(f"{name} holds values that are not finite")
 
 
 def _residual_shapes(features: str) -> dict[str, tuple[int, ...]]:

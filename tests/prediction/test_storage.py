@@ -174,7 +174,7 @@ def test_a_damaged_byte_is_refused_or_does_not_matter(tmp_path, stored, family):
         ({"dt": np.array(0.0)}, "dt holds 0, wanted values above 0"),
         ({"dt": np.array(0.005 + 0j)}, "dt holds complex numbers"),
         ({"dt": np.array("0.005")}, "dt holds values of type <U5"),
-        ({"dt": np.array(np.nan)}, "dt holds numbers that are not finite"),
+        ({"dt": np.array(np.nan)}, "dt holds values that are not finite"),
     ],
 )
 def test_an_array_that_does_not_fit_a_residual_is_named(tmp_path, change, said):
