@@ -121,7 +121,7 @@ def require_dataset(dataset: DatasetSpec, columns: int) -> None:
 def _check_shapes(states: np.ndarray, inputs: np.ndarray, feet: np.ndarray) -> None:
     for name, values in (("states", states), ("inputs", inputs), ("feet", feet)):
         if values.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: got values of type {values.dtype}, wanted real numbers")
+            raise ValueError(f"{name}: got values of type {values.dtype}, wanted real values")
     if states.ndim != 3 or states.shape[-1] != STATE_DIM:
         raise ValueError(f"states: got shape {states.shape}, wanted (rollouts, steps + 1, 6)")
     wanted = (states.shape[0], states.shape[1] - 1, INPUT_DIM)

@@ -102,7 +102,7 @@ def force_response_error(
     """Relative error of a linear model's velocity response to a held force, at the horizon's end.
 
     Powers of omega are observables that a linear fit closes badly. Where their coefficients are
-    large the velocity follows from differences of large numbers, which forces upset: prediction of
+    large the velocity follows from differences of large terms, which forces upset: prediction of
     a swinging body may still look right while an LMPC on the model throws the robot over.
 
     Args:

@@ -163,9 +163,9 @@ def _is_word(value: np.ndarray | None) -> bool:
 def _check_array(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
     """Raise a ValueError that says what is wrong with an array of a model."""
     if values.dtype.kind == "c":
-        raise ValueError(f"{name} holds complex numbers, wanted real ones")
+        raise ValueError(f"{name} holds complex values, wanted real ones")
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"{name} holds values of type {values.dtype}, wanted real numbers")
+        raise ValueError(f"{name} holds values of type {values.dtype}, wanted real values")
     if shape and values.ndim == len(shape) and len(values) != len(Mode):
         text = f"{name} holds {len(values)} contact modes, wanted {len(Mode)}"
         raise ValueError(text + ": fit it again, kjax had 5 before" * (len(values) == 5))
