@@ -194,10 +194,10 @@ def parse(
 
 def _require_walkable(config: RunConfig) -> None:
     """Raise a ValueError for a config that no controller can be made from, before it takes long."""
+    from kjax.controllers.resolve_model import resolve_model
     from kjax.controllers.walkable import check_walkable
-    from kjax.prediction.build import model_spec
 
-    model_spec(config.koopman)
+    resolve_model(config.koopman)
     with warnings.catch_warnings(action="ignore"):  # said again when the controller is made
         check_walkable(config, get_robot(config.robot).params)
 

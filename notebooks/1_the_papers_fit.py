@@ -23,20 +23,18 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from kjax.config import KoopmanConfig, SrbConfig  # noqa: E402
+from kjax.config import SrbConfig  # noqa: E402
 from kjax.controllers.rigid_body import own_body  # noqa: E402
 from kjax.koopman import edmd, observables  # noqa: E402
-from kjax.koopman.dataset import ranges_from_config, sample, shrink  # noqa: E402
+from kjax.koopman.dataset import DatasetSpec, sample, sample_ranges, shrink  # noqa: E402
 from kjax.prediction import evaluation, families  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
 from kjax.types import MODE_ALPHA, STATE_NAMES, Mode  # noqa: E402
 
 DT = 1e-3
-body = jax.tree.map(
-    lambda a: a[Mode.TROT], edmd.srb_params(own_body(SrbConfig(), get_robot().params))
-)
+body = own_body(SrbConfig(), get_robot().params)
 alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
-ranges = ranges_from_config(KoopmanConfig().dataset, vary_feet=False)
+ranges = sample_ranges(DatasetSpec())
 
 # %% [markdown]
 # ## Data, dictionary, fit

@@ -13,7 +13,6 @@
 
 # %%
 import jax
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -22,7 +21,6 @@ jax.config.update("jax_enable_x64", True)
 from kjax import RunConfig, load_config  # noqa: E402
 from kjax.config import SrbConfig  # noqa: E402
 from kjax.controllers.rigid_body import own_body  # noqa: E402
-from kjax.dynamics import srb_planar  # noqa: E402
 from kjax.prediction.features import affine, clock_history  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
 from kjax.sim.engines.mujoco_batch import BatchEngine  # noqa: E402
@@ -80,10 +78,7 @@ episodes = [
 data = transitions(episodes, dt=DT, sole=float(get_robot().params.foot_radius))
 train, test = split(np.arange(ROBOTS), share=0.33)
 fitted, held = (data.rows(np.isin(data.episode, own)) for own in (train, test))
-config = own_body(SrbConfig(), get_robot().params)
-body = srb_planar.SrbParams(
-    jnp.asarray(config.mass), jnp.asarray(config.inertia), jnp.zeros((2, 2))
-)
+body = own_body(SrbConfig(), get_robot().params)._replace(feet=np.zeros((2, 2)))
 models = {"affine": affine, "with clock and last force": clock_history}
 fits = {
     name: whole_body.fit(fitted, body, dt=DT, features=features, steps=5)

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax import gait
-from kjax.config import CommandConfig, KoopmanConfig, Overlay, RunConfig
+from kjax.config import CommandConfig, Overlay, RunConfig
 from kjax.config.gaits import gait_setting, reachable_gaits
 from kjax.config.units import InSi, in_si
 from kjax.controllers.params import ControllerParams, Fits
+from kjax.controllers.resolve_model import koopman_keys, model_choice, resolve_model
 from kjax.controllers.rigid_body import body_numbers, levers, mean_force, own_body
 from kjax.controllers.walkable import (
     Problem,
@@ -28,11 +29,11 @@ from kjax.controllers.walkable import (
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import Point, fit_modes, stack_bodies
 from kjax.legs import lateral, swing
-from kjax.mpc import multiphase
+from kjax.mpc import horizon
 from kjax.mpc.lmpc import ModeSettings
-from kjax.prediction.build import build_prediction, model_spec
+from kjax.prediction.build import build_prediction
 from kjax.prediction.evaluation import force_response_error
-from kjax.prediction.kind import get_kind
+from kjax.prediction.kind import ModelChoice, get_kind
 from kjax.robots import get_robot
 from kjax.spec import ControllerSpec, CycleSpec
 from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
@@ -82,7 +83,7 @@ def controller_spec(config: RunConfig) -> ControllerSpec:
         control_dt=lmpc.control_dt,
         model_dt=lmpc.model_dt,
         horizon=lmpc.horizon,
-        model=model_spec(config.koopman),
+        model=resolve_model(config.koopman),
         discounts_uncertainty=lmpc.uncertainty_discount > 0,
         friction_rows=lmpc.friction < inf,
         torque_rows=lmpc.torque_fraction < inf,
@@ -128,22 +129,22 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
     names = [gaits[problem.gait].name for problem in problems]
     feet = tuple(_nominal_feet(si, robot, name) for name in names)
     modes = tuple(problem.mode for problem in problems)
-    of_height = get_kind(si.koopman.model).of_height
+    choice = model_choice(si.koopman)
+    of_height = get_kind(choice.model).of_height
     heights = tuple(gait_setting(si, name, "body_height") if of_height else 0.0 for name in names)
     # What a file holds may have changed since.
-    fit = _fit.__wrapped__ if si.koopman.file else _fit
+    fit = _fit.__wrapped__ if choice.file else _fit
     mass, inertia = (float(number) for number in body_numbers(si, robot))
-    return fit(mass, inertia, si.koopman, modes, feet, heights)
+    with koopman_keys():
+        return fit(mass, inertia, choice, si.koopman.dataset.seed, modes, feet, heights)
 
 
 def _nominal_feet(config: InSi, robot: RobotParams, name: str) -> tuple[Point, Point]:
     """Contact points (x, z) of front and rear legs from the centre of mass, standing still [m]."""
     own, height = config.gaits[name], gait_setting(config, name, "body_height")
     if own.foothold_front is None or own.foothold_rear is None:
-        body = own_body(config.srb, robot, height)
-        assert body.feet_front is not None  # own_body filled them in
-        assert body.feet_rear is not None
-        return body.feet_front, body.feet_rear
+        front, rear = own_body(config.srb, robot, height).feet.tolist()
+        return tuple(front), tuple(rear)
     sole = float(robot.foot_radius - height)
     return (own.foothold_front, sole), (-own.foothold_rear, sole)
 
@@ -152,19 +153,23 @@ def _nominal_feet(config: InSi, robot: RobotParams, name: str) -> tuple[Point, P
 def _fit(
     mass: float,
     inertia: float,
-    koopman: KoopmanConfig,
+    choice: ModelChoice,
+    seed: int,
     modes: tuple[Mode, ...],
     feet: tuple[tuple[Point, Point], ...],
     heights: tuple[float, ...],
 ) -> Fits:
     body = stack_bodies(mass, inertia, feet)
-    key = jax.random.key(koopman.dataset.seed)
-    model, report = _fit_modes(body, koopman, key, modes=modes)
+    key = jax.random.key(seed)
+    model, report = _fit_modes(
+        body, key, modes=modes,
+        dictionary=choice.dictionary, dataset=choice.dataset, measured_feet=choice.measured_feet,
+    )  # fmt: skip
     if not bool(report.finite.all()):
-        raise ValueError("the EDMD fit is not finite: check srb and koopman.dataset ranges")
+        raise ValueError("dataset: the EDMD fit is not finite, check its ranges and srb")
     prediction = None
-    if get_kind(koopman.model).params is not None:
-        prediction = build_prediction(body, koopman, key, modes=modes, heights=heights)
+    if get_kind(choice.model).params is not None:
+        prediction = build_prediction(body, choice, key, modes=modes, heights=heights)
     spread = report.residual_rms if prediction is None else prediction.spread
     return jax.device_get(Fits(model, body.feet, spread, prediction))
 
@@ -268,7 +273,7 @@ def build_command(command: CommandConfig) -> Command:
     return Command(np.asarray(command.times, float), values)  # type: ignore[arg-type]
 
 
-_fit_modes = jax.jit(fit_modes, static_argnames=("config", "modes"))
+_fit_modes = jax.jit(fit_modes, static_argnames=("dictionary", "dataset", "measured_feet", "modes"))
 
 
 def _column(config: InSi, names: Sequence[str], key: str) -> Array:
@@ -314,7 +319,7 @@ def problem_settings(
 
 def multiphase_params(
     gaits: list[gait.Gait], config: InSi, robot: RobotParams
-) -> multiphase.MultiPhaseParams:
+) -> horizon.MultiPhaseParams:
     """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
     chosen = config.multiphase
     mass, inertia = body_numbers(config, robot)
@@ -322,7 +327,7 @@ def multiphase_params(
     names = [one.name for one in gaits]
     arms = [levers(config.gaits[name], robot) for name in names]
     feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in arms]
-    return multiphase.MultiPhaseParams(
+    return horizon.MultiPhaseParams(
         nodes=jnp.asarray(cycle_nodes(gaits, config)),
         state_weights=_column(config, names, "Q"),
         input_weight=_column(config, names, "R"),

@@ -3,17 +3,19 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.config import Overlay, RunConfig, SrbConfig
 from kjax.config.units import InSi
+from kjax.dynamics.srb_planar import SrbParams
 from kjax.gait import Gait
 from kjax.legs.posture import nominal_feet
 from kjax.types import GRAVITY, RobotParams
 
 
-def own_body(srb: SrbConfig, robot: RobotParams, height: float | None = None) -> SrbConfig:
-    """The rigid body of a config, the robot's own parameters where it gives none.
+def own_body(srb: SrbConfig, robot: RobotParams, height: float | None = None) -> SrbParams:
+    """The rigid body of a config, the robot's own where it gives none; NumPy in float64.
 
     Args:
       srb: of the config.
@@ -21,12 +23,15 @@ def own_body(srb: SrbConfig, robot: RobotParams, height: float | None = None) ->
       height: of the centre of mass in the nominal stance; the robot's own if ``None`` [m].
     """
     front, rear = nominal_feet(robot, float(robot.stand_height) if height is None else height)
-    return SrbConfig(
-        mass=float(robot.mass) if srb.mass is None else srb.mass,
-        inertia=float(robot.pitch_inertia) if srb.inertia is None else srb.inertia,
-        feet_front=front if srb.feet_front is None else srb.feet_front,
-        feet_rear=rear if srb.feet_rear is None else srb.feet_rear,
+    own = (
+        robot.mass if srb.mass is None else srb.mass,
+        robot.pitch_inertia if srb.inertia is None else srb.inertia,
+        (
+            front if srb.feet_front is None else srb.feet_front,
+            rear if srb.feet_rear is None else srb.feet_rear,
+        ),
     )
+    return SrbParams(*(np.asarray(part, float) for part in own))  # type: ignore[arg-type]
 
 
 def body_numbers(config: RunConfig | Overlay | InSi, robot: RobotParams) -> tuple[Any, Any]:

@@ -166,10 +166,7 @@ def _check_contact_points(config: RunConfig, robot: RobotParams) -> None:
     """Refuse contact points of the rigid body where no foot can stand."""
     if config.srb.feet_front is None and config.srb.feet_rear is None:
         return
-    own = own_body(config.srb, robot)
-    front, rear = own.feet_front, own.feet_rear
-    assert front is not None  # own_body filled them in
-    assert rear is not None
+    front, rear = own_body(config.srb, robot).feet.tolist()
     leg = float(robot.thigh_length + robot.calf_length)
     # The sole's distance from the hip, whatever the height of the hip above the centre of mass.
     longest = leg + float(robot.foot_radius) + abs(float(robot.hip_pos[:, 2].mean()))

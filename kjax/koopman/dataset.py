@@ -1,6 +1,7 @@
 """Samples for EDMD: random SRB rollouts, vmapped over contact modes, or one's own episodes."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -8,11 +9,43 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from kjax.config import DatasetConfig
 from kjax.dynamics import srb_planar
 from kjax.types import INPUT_DIM, STATE_DIM
 
 _PIECE = 256  # rollouts that are integrated side by side
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetSpec:
+    """Random SRB rollouts that models are fitted to, uniform in the ranges given here.
+
+    Attributes:
+      rollouts: number of rollouts per contact mode.
+      duration: length of a rollout [s].
+      dt: Runge-Kutta and snapshot step [s].
+      hold: number of steps for which each random force is held.
+      height: centre of the sampled heights [m].
+      state_range: half-ranges of the initial (p_x, p_z, theta, v_x, v_z, omega)
+        [m, rad, m/s, rad/s].
+      force_x: half-range of each leg's F_x, body frame [N].
+      force_z: range of each leg's F_z, body frame [N].
+      feet_range: half-ranges of the contact points' (x, z), where these are measured [m].
+    """
+
+    rollouts: int = 100
+    duration: float = 0.1
+    dt: float = 0.001
+    hold: int = 1
+    height: float = 0.27
+    state_range: tuple[float, ...] = (0.5, 0.1, 0.3, 1.0, 0.5, 2.0)
+    force_x: float = 60.0
+    force_z: tuple[float, float] = (0.0, 150.0)
+    feet_range: tuple[float, float] = (0.12, 0.05)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of a rollout."""
+        return round(self.duration / self.dt)
 
 
 class Snapshots(NamedTuple):
@@ -47,15 +80,15 @@ class SampleRanges(NamedTuple):
     feet_half: Float[Array, "2"]
 
 
-def ranges_from_config(config: DatasetConfig, *, vary_feet: bool) -> SampleRanges:
-    """Sampling ranges of a dataset config; ``vary_feet`` spreads the contact points as well."""
-    low, high = config.force_z
+def sample_ranges(dataset: DatasetSpec, *, vary_feet: bool = False) -> SampleRanges:
+    """Sampling ranges of a dataset; ``vary_feet`` spreads the contact points as well."""
+    low, high = dataset.force_z
     return SampleRanges(
-        state_centre=jnp.array([0.0, config.height, 0.0, 0.0, 0.0, 0.0]),
-        state_half=jnp.array(config.state_range),
-        input_low=jnp.array([-config.force_x, low] * 2),
-        input_high=jnp.array([config.force_x, high] * 2),
-        feet_half=jnp.array(config.feet_range if vary_feet else (0.0, 0.0)),
+        state_centre=jnp.array([0.0, dataset.height, 0.0, 0.0, 0.0, 0.0]),
+        state_half=jnp.array(dataset.state_range),
+        input_low=jnp.array([-dataset.force_x, low] * 2),
+        input_high=jnp.array([dataset.force_x, high] * 2),
+        feet_half=jnp.array(dataset.feet_range if vary_feet else (0.0, 0.0)),
     )
 
 
@@ -81,6 +114,8 @@ def sample(
     hold: int = 1,
 ) -> Snapshots:
     """Rollouts from random states under random forces, each force held for ``hold`` steps.
+
+    Eight arguments: what is drawn, and how much of it by keyword.
 
     Args:
       key: random key.
@@ -183,3 +218,11 @@ def _episode(number: int, episode: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
             f"({len(inputs)}, 2, 2)"
         )
     return states, inputs, feet
+
+
+def __getattr__(name: str) -> object:
+    if name == "ranges_from_config":
+        raise ImportError(
+            "kjax.koopman.dataset.ranges_from_config(config) is now sample_ranges(DatasetSpec(...))"
+        )
+    raise AttributeError(f"module 'kjax.koopman.dataset' has no attribute '{name}'")

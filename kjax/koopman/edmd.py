@@ -15,11 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from kjax.config import KoopmanConfig, SrbConfig
 from kjax.dynamics import srb_planar
 from kjax.koopman import regression
 from kjax.koopman.checks import check_snapshots, require_dataset, require_rows, require_steps
-from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
+from kjax.koopman.dataset import DatasetSpec, SampleRanges, Snapshots, sample, sample_ranges
 from kjax.koopman.models import BilinearModel, LinearModel
 from kjax.koopman.observables import (
     STATE_ROWS,
@@ -196,29 +195,27 @@ def spectrum(A: Float[np.ndarray, "N N"], dt: float) -> np.ndarray:
     return rates[np.argsort(-rates.real)]
 
 
-def build_dictionary(config: DictionarySpec | KoopmanConfig) -> Dictionary:
-    """The dictionary that a spec, or a config, names."""
-    if config.dictionary == "monomials":
-        return monomials(config.order)
-    if config.dictionary == "fourier":
-        return fourier(config.fourier_count, scale=config.fourier_scale, seed=config.fourier_seed)
+def build_dictionary(spec: DictionarySpec) -> Dictionary:
+    """The dictionary that a spec names."""
+    if spec.dictionary == "monomials":
+        return monomials(spec.order)
+    if spec.dictionary == "fourier":
+        return fourier(spec.fourier_count, scale=spec.fourier_scale, seed=spec.fourier_seed)
     return paper(
-        config.order,
-        literal=config.dictionary == "paper_literal",
-        constant_rotation=config.constant_rotation,
+        spec.order,
+        literal=spec.dictionary == "paper_literal",
+        constant_rotation=spec.constant_rotation,
     )
 
 
-def srb_params(config: SrbConfig) -> srb_planar.SrbParams:
+def srb_params(body: srb_planar.SrbParams) -> srb_planar.SrbParams:
     """Body parameters, the same in every contact mode: stacked over ``types.Mode``.
 
     Args:
-      config: mass, inertia and contact points, from ``rigid_body.own_body``.
+      body: of one mode, as ``rigid_body.own_body`` gives it.
     """
-    if config.mass is None or config.inertia is None:
-        raise ValueError("srb.mass and srb.inertia are left out: see rigid_body.own_body")
-    feet = np.array([config.feet_front, config.feet_rear], float)
-    return stack_bodies(config.mass, config.inertia, np.tile(feet, (len(Mode), 1, 1)))
+    feet = np.tile(np.asarray(body.feet, float), (len(Mode), 1, 1))
+    return stack_bodies(float(body.mass), float(body.inertia), feet)
 
 
 def stack_bodies(
@@ -241,9 +238,11 @@ def stack_bodies(
 
 def fit_modes(
     body: srb_planar.SrbParams,
-    config: KoopmanConfig,
     key: PRNGKeyArray,
     *,
+    dictionary: DictionarySpec = DictionarySpec(),  # noqa: B008, it is frozen
+    dataset: DatasetSpec = DatasetSpec(),  # noqa: B008
+    measured_feet: bool = False,
     ranges: SampleRanges | None = None,
     modes: Sequence[Mode] = tuple(Mode),
 ) -> tuple[LinearModel, FitReport]:
@@ -251,20 +250,20 @@ def fit_modes(
 
     Args:
       body: parameters of the rigid body in every mode, stacked (``srb_params``).
-      config: dictionary, dataset and kind of contact points.
-      key: random key, usually of ``config.dataset.seed``; an argument, since XLA would evaluate
-        the whole data set of a constant one while it compiles.
-      ranges: sampling ranges in place of the config's.
+      key: random key of the dataset; traced, since XLA would evaluate the whole dataset of a
+        constant one while it compiles.
+      dictionary: observables.
+      dataset: size and ranges of the training data.
+      measured_feet: whether the contact points vary, and B with them.
+      ranges: sampling ranges in place of the dataset's own.
       modes: contact modes that ``body`` is stacked over; data of a mode are the same in any list.
 
     Returns:
       Model and report, each with a leading axis over ``modes``.
     """
-    dictionary = build_dictionary(config)
-    data = config.dataset
-    vary_feet = config.feet == "measured"
-    require_dataset(data, dictionary.size + INPUT_DIM + (8 if vary_feet else 0))
-    limits = ranges_from_config(data, vary_feet=vary_feet) if ranges is None else ranges
+    observables = build_dictionary(dictionary)
+    require_dataset(dataset, observables.size + INPUT_DIM + (8 if measured_feet else 0))
+    limits = sample_ranges(dataset, vary_feet=measured_feet) if ranges is None else ranges
 
     def one(key: Array, alpha: Array, body: srb_planar.SrbParams) -> tuple[LinearModel, FitReport]:
         snapshots = sample(
@@ -272,12 +271,12 @@ def fit_modes(
             body,
             alpha,
             limits,
-            rollouts=data.rollouts,
-            steps=round(data.duration / data.dt),
-            dt=data.dt,
-            hold=data.hold,
+            rollouts=dataset.rollouts,
+            steps=dataset.steps,
+            dt=dataset.dt,
+            hold=dataset.hold,
         )
-        return fit(dictionary, snapshots, feet_terms=vary_feet)
+        return fit(observables, snapshots, feet_terms=measured_feet)
 
     chosen = np.array(modes)
     keys = jax.random.split(key, len(Mode))[chosen]

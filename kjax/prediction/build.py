@@ -1,4 +1,4 @@
-"""The prediction model that a config names: family, parameters of each contact mode, spread."""
+"""The prediction model that is chosen: family, parameters of each contact mode, spread."""
 
 from typing import Any, NamedTuple
 
@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from kjax.config import ConfigError, KoopmanConfig
 from kjax.dynamics import srb_planar
 from kjax.prediction import families
 from kjax.prediction.families import Family
-from kjax.prediction.kind import Bodies, get_kind
+from kjax.prediction.kind import Bodies, ModelChoice, get_kind
 from kjax.spec import ModelSpec
 from kjax.types import MODE_ALPHA, Mode
 
@@ -31,28 +30,24 @@ class Prediction(NamedTuple):
     spread: Float[Array, "M 6"]
 
 
-def model_spec(config: KoopmanConfig) -> ModelSpec:
-    """What shapes the program of a config's model.
+def model_spec(choice: ModelChoice) -> ModelSpec:
+    """What shapes the program of a model.
 
     Raises:
-      ConfigError: for a model that there is not, or a file that cannot be used.
+      ValueError: for a model that there is not, or a file that cannot be used.
     """
-    kind = get_kind(config.model)
-    if kind.takes_file and not config.file:
-        raise ConfigError(
-            f"koopman.file: model = '{config.model}' needs a file with its parameters"
-        )
-    if config.file and not kind.takes_file:
-        raise ConfigError(
-            f"koopman.file: model = '{config.model}' takes no file, got '{config.file}'"
-        )
+    kind = get_kind(choice.model)
+    if kind.takes_file and not choice.file:
+        raise ValueError(f"file: model = '{choice.model}' needs a file with its parameters")
+    if choice.file and not kind.takes_file:
+        raise ValueError(f"file: model = '{choice.model}' takes no file, got '{choice.file}'")
     spec = ModelSpec(
-        kind=config.model,
-        dt=config.dataset.dt,
-        measured_feet=config.feet == "measured",
+        kind=choice.model,
+        dt=choice.dataset.dt,
+        measured_feet=choice.measured_feet,
         tabulated=kind.params is None,
     )
-    return kind.spec(config, spec)
+    return kind.spec(choice, spec)
 
 
 def build_family(spec: ModelSpec) -> Family:
@@ -62,28 +57,27 @@ def build_family(spec: ModelSpec) -> Family:
 
 def build_prediction(
     body: srb_planar.SrbParams,
-    config: KoopmanConfig,
+    choice: ModelChoice,
     key: PRNGKeyArray,
     *,
     modes: tuple[Mode, ...],
     heights: tuple[float, ...],
 ) -> Prediction:
-    """Parameters of a config's model in every contact mode; for all but the linear EDMD model.
+    """Parameters of a model in every contact mode; for all but the linear EDMD model.
 
     Args:
       body: parameters of the rigid body in every mode, stacked.
-      config: of the model.
+      choice: of the model.
       key: random key of the training data.
       modes: contact modes that ``body`` is stacked over.
       heights: of the centre of mass in each, for what is linearised beforehand [m].
 
     Raises:
-      ConfigError: for a file that cannot be used.
-      ValueError: for a fit that is not finite.
+      ValueError: for a file that cannot be used, or a fit that is not finite.
     """
-    make = get_kind(config.model).params
+    make = get_kind(choice.model).params
     if make is None:
-        raise ValueError(f"model '{config.model}' has its own tables (edmd.fit_modes)")
+        raise ValueError(f"model: '{choice.model}' has its own tables (edmd.fit_modes)")
     alpha = jnp.asarray(MODE_ALPHA[np.array(modes)], float)
-    params, spread = make(config, Bodies(body, alpha, modes, heights, key))
+    params, spread = make(choice, Bodies(body, alpha, modes, heights, key))
     return Prediction(params=params, force=jax.vmap(families.hover)(body, alpha), spread=spread)

@@ -49,6 +49,8 @@ def prediction_errors(
 ) -> Float[Array, "states profiles steps 6"]:
     """Open-loop errors of every initial state under every force profile.
 
+    Eleven arguments: the model, the body, and the size of the test set by keyword.
+
     The paper pairs 50 random initial states with 50 random force profiles over 0.05 s. The
     prediction lifts once, at the start, and then runs in the lifted space alone.
 
@@ -97,10 +99,10 @@ def force_response_error(
     steps: int,
     duration: float,
 ) -> float:
-    """How wrong a linear model's answer of the velocity to a held force is, at the horizon's end.
+    """Relative error of a linear model's velocity response to a held force, at the horizon's end.
 
     Powers of omega are observables that a linear fit closes badly. Where their coefficients are
-    large the velocity follows from differences of large numbers, which forces upset: prediction of
+    large the velocity follows from differences of large terms, which forces upset: prediction of
     a swinging body may still look right while an LMPC on the model throws the robot over.
 
     Args:
@@ -126,8 +128,8 @@ def force_response_error(
         x, z = np.asarray(body.feet, np.float64)[end]
         wanted[0, 2 * end] = wanted[1, 2 * end + 1] = legs * duration / mass
         # A moment turns the body and with it the vertical force that carries the weight.
-        turn = legs * np.array([-z, x]) / inertia
-        wanted[0, 2 * end : 2 * end + 2] -= GRAVITY * turn * duration**3 / 6
+        pitch_acceleration = legs * np.array([-z, x]) / inertia
+        wanted[0, 2 * end : 2 * end + 2] -= GRAVITY * pitch_acceleration * duration**3 / 6
     scale = np.abs(wanted).max(axis=1, keepdims=True)
     return float((np.abs(total[STATE_ROWS][3:5] - wanted) / scale).max())
 
@@ -166,7 +168,10 @@ def model_errors(
     *,
     frozen: bool = False,
 ) -> Float[Array, "states profiles steps 6"]:
-    """Predicted minus true states of every start under every force profile, open loop."""
+    """Predicted minus true states of every start under every force profile, open loop.
+
+    Eight arguments: a model (family, params), a body (plant, body, alpha), and what they meet.
+    """
 
     def one(x0: Array, u: Array) -> Array:
         predicted = open_loop(family, params, families.Start(x0, body.feet), u, frozen=frozen)

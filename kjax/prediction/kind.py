@@ -1,23 +1,46 @@
-"""A kind of prediction model: how a config's choice becomes a spec, a family and its parameters.
+"""A kind of prediction model: how a choice becomes a spec, a family and its parameters.
 
-``koopman.model`` names one: of the modules in ``kjax.prediction.kinds``, or ``"module:NAME"`` for
-one's own. Everything else asks the record.
+``ModelChoice.model`` names one: of the modules in ``kjax.prediction.kinds``, or ``"module:NAME"``
+for one's own. Everything else asks the record.
 """
 
 import importlib
 import pkgutil
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from kjax.config import ConfigError, KoopmanConfig
 from kjax.dynamics.srb_planar import SrbParams
+from kjax.koopman.dataset import DatasetSpec
 from kjax.lookup import look_up
 from kjax.prediction.families import Family
-from kjax.spec import ModelSpec
+from kjax.spec import DictionarySpec, ModelSpec
 from kjax.types import Mode
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelChoice:
+    """Which prediction model, and what its parameters come from.
+
+    A ValueError about one of these begins with its name.
+
+    Attributes:
+      model: its kind, one of ``model_kinds()``, or ``"module:NAME"`` for a ``ModelKind`` of one's
+        own.
+      file: with fitted parameters, for the kinds that take one.
+      dictionary: observables, for the kinds that are fitted by EDMD.
+      dataset: that these are fitted to; its step is the model's.
+      measured_feet: whether contact points are the robot's own rather than constant per mode.
+    """
+
+    model: str = "linear"
+    file: str = ""
+    dictionary: DictionarySpec = field(default_factory=DictionarySpec)
+    dataset: DatasetSpec = field(default_factory=DatasetSpec)
+    measured_feet: bool = False
 
 
 class Bodies(NamedTuple):
@@ -45,15 +68,15 @@ class ModelKind(NamedTuple):
       family: of a spec.
       params: parameters in every contact mode, and (M, 6) standard deviation of the one-step error;
         ``None`` for one whose tables are made once from the EDMD fit ("linear").
-      spec: what shapes the program, from the config and a spec that has kind, step and feet.
-      takes_file: whether ``koopman.file`` holds its parameters.
+      spec: what shapes the program, from the choice and a spec that has kind, step and feet.
+      takes_file: whether ``ModelChoice.file`` holds its parameters.
       is_body: whether its parameters are the rigid body's own: mass and inertia may be tuned.
       of_height: whether its parameters depend on the reference height.
     """
 
     family: Callable[[ModelSpec], Family]
-    params: Callable[[KoopmanConfig, Bodies], tuple[Any, Any]] | None
-    spec: Callable[[KoopmanConfig, ModelSpec], ModelSpec] = lambda config, spec: spec
+    params: Callable[[ModelChoice, Bodies], tuple[Any, Any]] | None
+    spec: Callable[[ModelChoice, ModelSpec], ModelSpec] = lambda choice, spec: spec
     takes_file: bool = False
     is_body: bool = False
     of_height: bool = False
@@ -77,10 +100,7 @@ def get_kind(name: str) -> ModelKind:
     """A kind of model by its name.
 
     Raises:
-      ConfigError: for a name that is none.
+      ValueError: for a name that is none.
     """
-    try:
-        kind: ModelKind = look_up("koopman.model", name, model_kinds(), ModelKind)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
+    kind: ModelKind = look_up("model", name, model_kinds(), ModelKind)
     return kind

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kjax.config import ConfigError
 from kjax.koopman.models import BilinearModel
 from kjax.prediction.families import Past, Start
 from kjax.prediction.features import BY_NAME
@@ -80,11 +79,13 @@ def load(path: str | Path, family: str) -> Stored:
       family: ``"residual"`` or ``"learned"``.
 
     Raises:
-      ConfigError: in one line that names the file and the fault: not there, not readable, not a
+      ValueError: in one line that names the file and the fault: missing, unreadable, not a
         model's, of another family, or with an array that is missing, not real, not finite, or of
         another shape than the family and the other arrays ask for.
     """
     file = resolve(path)
+    if not file.name:
+        raise _fault(file, "is no file")
     arrays = _read(file)
     if family not in ("residual", "learned"):
         raise ValueError(f"family must be 'residual' or 'learned', got {family!r}")
@@ -122,8 +123,11 @@ def load(path: str | Path, family: str) -> Stored:
 
 def resolve(path: str | Path) -> Path:
     """The file that ``load`` reads for a path: the one that ``save`` writes, or the path itself."""
+    path = Path(path)
+    if not path.name:
+        return path
     file = _with_suffix(path)
-    return file if file.exists() else Path(path)
+    return file if file.exists() else path
 
 
 def _with_suffix(path: str | Path) -> Path:
@@ -133,8 +137,8 @@ def _with_suffix(path: str | Path) -> Path:
     return path if path.name.endswith(_SUFFIX) else path.with_name(path.name + _SUFFIX)
 
 
-def _fault(file: Path, text: str) -> ConfigError:
-    return ConfigError(f"koopman.file: '{file}' {text}")
+def _fault(file: Path, text: str) -> ValueError:
+    return ValueError(f"file: '{file}' {text}")
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -149,7 +153,7 @@ def _read(file: Path) -> dict[str, Any]:
         reason = error.strerror or str(error)
     except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
         reason = f"it is empty, cut off, damaged or no .npz ({error})"
-    raise ConfigError(f"koopman.file: cannot read '{file}': {reason.splitlines()[0]}")
+    raise ValueError(f"file: cannot read '{file}': {reason.splitlines()[0]}")
 
 
 def _is_word(value: np.ndarray | None) -> bool:
@@ -159,16 +163,16 @@ def _is_word(value: np.ndarray | None) -> bool:
 def _check_array(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
     """Raise a ValueError that says what is wrong with an array of a model."""
     if values.dtype.kind == "c":
-        raise ValueError(f"{name} holds complex numbers, wanted real ones")
+        raise ValueError(f"{name} holds complex values, wanted real ones")
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"{name} holds values of type {values.dtype}, wanted real numbers")
+        raise ValueError(f"{name} holds values of type {values.dtype}, wanted real values")
     if shape and values.ndim == len(shape) and len(values) != len(Mode):
         text = f"{name} holds {len(values)} contact modes, wanted {len(Mode)}"
         raise ValueError(text + ": fit it again, kjax had 5 before" * (len(values) == 5))
     if values.shape != shape:
         raise ValueError(f"{name} has shape {values.shape}, wanted {shape}")
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds numbers that are not finite")
+        raise ValueError(f"{name} holds values that are not finite")
 
 
 def _residual_shapes(features: str) -> dict[str, tuple[int, ...]]:

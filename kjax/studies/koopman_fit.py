@@ -15,8 +15,9 @@ import numpy as np
 
 from kjax import cli
 from kjax.config import FitStudyConfig
+from kjax.controllers.resolve_model import koopman_keys, model_choice
 from kjax.controllers.rigid_body import own_body
-from kjax.koopman.dataset import SampleRanges, ranges_from_config, shrink
+from kjax.koopman.dataset import SampleRanges, sample_ranges, shrink
 from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
 from kjax.prediction.evaluation import ErrorStatistics, prediction_errors, summarise
 from kjax.robots import get_robot
@@ -33,7 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     cli.configure_jax()
     folder = cli.output_folder(args, "koopman_fit")
     try:
-        result, curves = fit_study(config)
+        with koopman_keys():
+            result, curves = fit_study(config)
     except ValueError as error:
         cli.fail(str(error))
     _print(config, result)
@@ -56,9 +58,10 @@ def fit_study(config: FitStudyConfig) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
       ValueError: if the fit is not finite.
     """
-    koopman, data = config.koopman, config.koopman.dataset
+    choice = model_choice(config.koopman)
+    data = choice.dataset
     dictionary, body = (
-        build_dictionary(koopman),
+        build_dictionary(choice.dictionary),
         srb_params(own_body(config.srb, get_robot(config.robot).params)),
     )
     steps = round(config.test_duration / data.dt)
@@ -67,8 +70,15 @@ def fit_study(config: FitStudyConfig) -> tuple[dict[str, Any], dict[str, Any]]:
     @jax.jit
     def study(key: jax.Array, scale: jax.Array) -> tuple[Any, ErrorStatistics]:
         """Fit and test on ranges shrunk by ``scale``."""
-        ranges = shrink(ranges_from_config(data, vary_feet=koopman.feet == "measured"), scale)
-        model, report = fit_modes(body, koopman, key, ranges=ranges)
+        ranges = shrink(sample_ranges(data, vary_feet=choice.measured_feet), scale)
+        model, report = fit_modes(
+            body,
+            key,
+            dictionary=choice.dictionary,
+            dataset=data,
+            measured_feet=choice.measured_feet,
+            ranges=ranges,
+        )
 
         def test(mode: jax.Array, alpha: jax.Array) -> ErrorStatistics:
             here = jax.tree.map(lambda leaf: leaf[mode], body)
@@ -91,10 +101,10 @@ def fit_study(config: FitStudyConfig) -> tuple[dict[str, Any], dict[str, Any]]:
 
         return report, jax.vmap(test)(chosen, jnp.asarray(MODE_ALPHA, float)[chosen])
 
-    key = jax.random.key(data.seed)
+    key = jax.random.key(config.koopman.dataset.seed)
     report, statistics = jax.device_get(study(key, jnp.asarray(1.0)))
     if not report.finite.all():
-        raise ValueError("the fit is not finite: check srb and koopman.dataset ranges")
+        raise ValueError("dataset: the fit is not finite, check its ranges and srb")
     result: dict[str, Any] = {"fit": {}, "error_at_end": {}, "largest_scale_within_tolerance": {}}
     for mode in MODES.values():
         result["fit"][mode.name.lower()] = {
@@ -130,8 +140,8 @@ def save_figure(config: FitStudyConfig, curves: dict[str, Any], path: Path) -> N
 
 def _print(config: FitStudyConfig, result: dict[str, Any]) -> None:
     koopman = config.koopman
-    print(f"dictionary '{koopman.dictionary}', p = {koopman.order}: "
-          f"{build_dictionary(koopman).size} observables")  # fmt: skip
+    size = build_dictionary(model_choice(koopman).dictionary).size
+    print(f"dictionary '{koopman.dictionary}', p = {koopman.order}: {size} observables")
     for name, fit in result["fit"].items():
         print(
             f"  {name:6} rank {fit['rank']} of {fit['columns']}, condition of the "

@@ -23,9 +23,9 @@ from kjax import cli
 from kjax.config import CommandConfig, RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.controllers.resolve import resolve
+from kjax.controllers.resolve_model import dataset_spec
 from kjax.controllers.rigid_body import own_body
-from kjax.koopman import edmd
-from kjax.koopman.dataset import ranges_from_config, sample
+from kjax.koopman.dataset import sample, sample_ranges
 from kjax.prediction import families, learned, storage
 from kjax.robots import get_robot
 from kjax.sim.closed_cost import recording_costs
@@ -129,12 +129,9 @@ def short(args: argparse.Namespace, path: Path) -> RunConfig:
 def draw(seed: int, rollouts: int) -> Any:
     """Rollouts of the trot's rigid body on the ranges of the config."""
     config = RunConfig()
-    body = jax.tree.map(
-        lambda a: a[Mode.TROT],
-        edmd.srb_params(own_body(config.srb, get_robot(config.robot).params)),
-    )
+    body = jax.tree.map(jnp.asarray, own_body(config.srb, get_robot(config.robot).params))
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
-    ranges = ranges_from_config(config.koopman.dataset, vary_feet=False)
+    ranges = sample_ranges(dataset_spec(config.koopman.dataset))
     one = partial(sample, rollouts=rollouts, steps=STEPS, dt=DT)
     return jax.jit(one)(jax.random.key(seed), body, alpha, ranges)
 

@@ -26,7 +26,7 @@ from kjax.types import RobotParams
 
 
 class PlantParams(NamedTuple):
-    """Numbers of the plant; data, so that every scenario may have its own.
+    """Parameters of the plant; data, so that every scenario may have its own.
 
     Attributes:
       mass: [kg].
@@ -63,6 +63,8 @@ def nominal_plant(
     spin: float = 1.0,
 ) -> PlantParams:
     """The plant of a robot that stands: its centre of mass is that of the whole body.
+
+    Eight arguments: those of ``PlantParams``, with defaults.
 
     Args:
       robot: geometry and masses of the links.
@@ -200,7 +202,7 @@ def advance(
     """State ``dt`` [s] later, forces held in the body frame; one Runge-Kutta step.
 
     Args:
-      plant: numbers.
+      plant: parameters.
       stance: (4,) legs that stand.
       x: (6,) state.
       contact: (4, 2) contact points of the feet, world [m].

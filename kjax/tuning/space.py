@@ -1,8 +1,8 @@
-"""Numbers of a config as variables, by key, in coordinates in which their steps compare.
+"""Parameters of a config as variables, by key, in coordinates in which their steps compare.
 
 A positive number p is the variable log(p): a step of 0.1 is one of ten per cent, of a weight of 3e4
-and of one of 0.1 alike. Others are divided by a size that matters. ``params`` maps variables to all
-numbers of a controller by the same code that builds them from a config, and may be differentiated.
+and of one of 0.1 alike. Others are divided by a size that matters. ``params`` maps variables to the
+parameters of a controller by the same code that builds them from a config; it is differentiable.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ class Space(NamedTuple):
     Attributes:
       kinds: in which coordinate and range each key is tuned.
       start: variables of the config itself.
-      values: variables -> numbers by key.
+      values: variables -> values by key.
       inside: variables -> the nearest ones in their ranges.
       params: variables -> controller parameters; differentiable.
       overrides: variables -> plain values by key, for ``config.load_config`` and TOML.
@@ -62,7 +62,7 @@ def build_space(
     (gaits.NAME.feet_*, height), models with fixed feet stay those of the config.
 
     Args:
-      config: that all other numbers come from.
+      config: that all other parameters come from.
       keys: of ``TUNABLE``.
       robot: whose controller it is; that of the config if ``None``.
       fits: models; those of the config if ``None``.
@@ -72,16 +72,7 @@ def build_space(
     """
     robot = get_robot(config.robot).params if robot is None else robot
     kinds = tunable(RunConfig, config.gaits)
-    if not keys:
-        raise ValueError("keys must name at least one variable, got none")
-    for key in keys:
-        if key not in kinds:
-            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
-        if key.startswith("srb.") and not get_kind(config.koopman.model).is_body:
-            raise ValueError(
-                f"keys: '{key}' is a variable of models that are the rigid body ('srb', 'planted', "
-                f"'exact') only; got '{config.koopman.model}', which is fitted to data"
-            )
+    _check_keys(config, keys, kinds)
     mass, inertia = (float(number) for number in body_numbers(config, robot))
     config = replace(config, srb=replace(config.srb, mass=mass, inertia=inertia))
     if fits is None:
@@ -103,35 +94,61 @@ def build_space(
 
     def params(variables: Variables) -> ControllerParams:
         values_by_key = values(variables)
-        own = fits
-        if own.prediction is not None and isinstance(own.prediction.params, BodyModel):
-            body = own.prediction.params.body
-            body = body._replace(
-                **{
-                    key.removeprefix("srb."): jnp.broadcast_to(number, body.mass.shape)
-                    for key, number in values_by_key.items()
-                    if key.startswith("srb.")
-                }
-            )
-            model = own.prediction.params._replace(body=body)
-            own = own._replace(prediction=own.prediction._replace(params=model))
-        return cast(gather(Overlay(config, values_by_key), robot, own), dtype)
+        return cast(
+            gather(Overlay(config, values_by_key), robot, _with_body(fits, values_by_key)), dtype
+        )
 
     def overrides(variables: Variables) -> dict[str, Any]:
         return {key: np.asarray(one, float).tolist() for key, one in values(variables).items()}
 
-    start = {}
-    for key in keys:
-        held: Any = config
-        for part in key.split("."):
-            held = held[part] if isinstance(held, Gaits) else getattr(held, part)
-        if held is None:
-            raise ValueError(f"{key} is not given by the config: it has no value to start from")
-        number = np.asarray(held, float)
-        if kinds[key].unit is None and not (number > 0).all():
-            raise ValueError(f"{key} must be positive to be tuned, got {number.tolist()}")
-        start[key] = jnp.asarray(_forward(kinds[key], number), dtype)
+    start = {
+        key: jnp.asarray(_forward(kinds[key], _value_of(config, key, kinds[key])), dtype)
+        for key in keys
+    }
     return Space({key: kinds[key] for key in keys}, start, values, inside, params, overrides)
+
+
+def _check_keys(config: RunConfig, keys: Sequence[str], kinds: Mapping[str, Tunable]) -> None:
+    """Raise a ValueError for keys that are no variables of this config."""
+    if not keys:
+        raise ValueError("keys must name at least one variable, got none")
+    for key in keys:
+        if key not in kinds:
+            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
+        if key.startswith("srb.") and not get_kind(config.koopman.model).is_body:
+            raise ValueError(
+                f"keys: '{key}' is a variable of models that are the rigid body ('srb', 'planted', "
+                f"'exact') only; got '{config.koopman.model}', which is fitted to data"
+            )
+
+
+def _value_of(config: RunConfig, key: str, kind: Tunable) -> np.ndarray:
+    """What the config holds at a key, to start from."""
+    held: Any = config
+    for part in key.split("."):
+        held = held[part] if isinstance(held, Gaits) else getattr(held, part)
+    if held is None:
+        raise ValueError(f"{key} is not given by the config: it has no value to start from")
+    number = np.asarray(held, float)
+    if kind.unit is None and not (number > 0).all():
+        raise ValueError(f"{key} must be positive to be tuned, got {number.tolist()}")
+    return number
+
+
+def _with_body(fits: Fits, values_by_key: Mapping[str, Array]) -> Fits:
+    """The fits with the tuned mass and inertia, where the model is the rigid body itself."""
+    if fits.prediction is None or not isinstance(fits.prediction.params, BodyModel):
+        return fits
+    body = fits.prediction.params.body
+    body = body._replace(
+        **{
+            key.removeprefix("srb."): jnp.broadcast_to(number, body.mass.shape)
+            for key, number in values_by_key.items()
+            if key.startswith("srb.")
+        }
+    )
+    model = fits.prediction.params._replace(body=body)
+    return fits._replace(prediction=fits.prediction._replace(params=model))
 
 
 def tuned_config(config: RunConfig, overrides: Mapping[str, Any]) -> RunConfig:

@@ -629,7 +629,7 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
     feet = np.array(view.planar.feet - view.planar.x[:2]).reshape(2, 2, 2)
     feet[..., 1] -= go1.FOOT_RADIUS
     contacts = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])
-    family = build.build_family(build.model_spec(config.koopman))
+    family = build.build_family(controller_spec(config).model)
     model_params, force, _ = jax.tree.map(lambda a: a[0], tables.params.fits.prediction)
 
     def forces(u_before, elapsed):

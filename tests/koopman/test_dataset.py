@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from kjax.config import DatasetConfig
 from kjax.koopman import dataset
+from kjax.koopman.dataset import DatasetSpec
 from kjax.types import MODE_ALPHA, Mode
 
 DT = 1e-3  # s, the step of the shared snapshots
@@ -26,7 +26,7 @@ def sampler(body):
 
 @pytest.fixture(scope="module")
 def ranges():
-    return dataset.ranges_from_config(DatasetConfig(), vary_feet=True)
+    return dataset.sample_ranges(DatasetSpec(), vary_feet=True)
 
 
 def derivative(body, alpha, feet, u, x):
@@ -54,8 +54,8 @@ def test_each_rollout_obeys_the_dynamics_with_its_own_contact_points(
 def test_samples_fill_their_ranges_and_stay_inside(snapshots, snapshots_moving_feet, body):
     start, inputs = snapshots.states[:, :, 0], snapshots.inputs
     half = np.array([0.5, 0.1, 0.3, 1.0, 0.5, 2.0])
-    centre = np.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0])
-    spread = (np.asarray(start).reshape(-1, 6) - centre) / half
+    middle = np.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0])
+    spread = (np.asarray(start).reshape(-1, 6) - middle) / half
     forces = np.asarray(inputs).reshape(-1, 4)
     low, high = np.array([-60.0, 0.0, -60.0, 0.0]), np.array([60.0, 150.0, 60.0, 150.0])
     shift = np.asarray((snapshots_moving_feet.feet - body.feet) / jnp.array([0.12, 0.05]))
@@ -68,7 +68,7 @@ def test_samples_fill_their_ranges_and_stay_inside(snapshots, snapshots_moving_f
 
 def test_contact_points_stay_put_unless_asked_to_vary(snapshots, body):
     np.testing.assert_array_equal(snapshots.feet, np.broadcast_to(body.feet, (len(Mode), 40, 2, 2)))
-    still = dataset.ranges_from_config(DatasetConfig(), vary_feet=False)
+    still = dataset.sample_ranges(DatasetSpec())
     np.testing.assert_array_equal(still.feet_half, 0.0)
 
 
@@ -98,15 +98,15 @@ def test_each_force_is_held_and_a_last_incomplete_piece_is_cut(sampler, ranges):
     np.testing.assert_array_equal(changes, [False, False, True, False, False, True])
 
 
-def test_ranges_come_from_the_config_in_the_order_of_state_and_input():
-    config = DatasetConfig(
+def test_ranges_come_from_the_spec_in_the_order_of_state_and_input():
+    spec = DatasetSpec(
         height=0.3,
         state_range=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
         force_x=7.0,
         force_z=(8.0, 9.0),
         feet_range=(0.1, 0.2),
     )
-    ranges = dataset.ranges_from_config(config, vary_feet=True)
+    ranges = dataset.sample_ranges(spec, vary_feet=True)
     np.testing.assert_array_equal(ranges.state_centre, [0, 0.3, 0, 0, 0, 0])
     np.testing.assert_array_equal(ranges.state_half, [1, 2, 3, 4, 5, 6])
     np.testing.assert_array_equal(ranges.input_low, [-7, 8, -7, 8])
@@ -117,7 +117,7 @@ def test_ranges_come_from_the_config_in_the_order_of_state_and_input():
 def test_shrinking_keeps_the_centres_and_scales_the_widths(ranges):
     half = dataset.shrink(ranges, jnp.asarray(0.5))
     np.testing.assert_array_equal(half.state_centre, ranges.state_centre)
-    # Rounding of the scaled ends, at most 150 N.
+    # Rounding of the scaled bounds, at most 150 N.
     np.testing.assert_allclose(half.state_half, 0.5 * ranges.state_half, rtol=1e-15)
     np.testing.assert_allclose(half.input_low, [-30.0, 37.5, -30.0, 37.5], rtol=0, atol=1e-13)
     np.testing.assert_allclose(half.input_high, [30.0, 112.5, 30.0, 112.5], rtol=0, atol=1e-13)
@@ -133,3 +133,8 @@ def test_a_scan_over_ranges_is_a_vmap(sampler, ranges):
     single = sampler(key, dataset.shrink(ranges, scales[1]))
     # The same operations, fused differently; forces reach 150 N.
     chex.assert_trees_all_close(jax.tree.map(lambda a: a[1], batch), single, rtol=0, atol=1e-11)
+
+
+def test_the_old_name_of_sample_ranges_says_the_new_one():
+    with pytest.raises(ImportError, match="is now sample_ranges"):
+        from kjax.koopman.dataset import ranges_from_config  # noqa: F401

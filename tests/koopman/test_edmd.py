@@ -5,13 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.config import DatasetConfig, KoopmanConfig, SrbConfig
+from kjax.dynamics.srb_planar import SrbParams
 from kjax.koopman import edmd, models, observables
-from kjax.koopman.dataset import Snapshots
+from kjax.koopman.dataset import DatasetSpec, Snapshots
+from kjax.spec import DictionarySpec
 from kjax.types import MODE_ALPHA, Mode
 
 DT = 1e-3  # s, the step of the shared snapshots
 STATE = slice(1, 7)
+BODY = SrbParams(mass=10.0, inertia=0.3, feet=np.array([[0.2, -0.3], [-0.1, -0.3]]))
 
 
 input_map = jax.jit(models.input_map)
@@ -138,7 +140,7 @@ def test_pitch_acceleration_is_modelled_exactly_for_fixed_contact_points(mode, f
     row = pick(fitted[0], mode).B[6]
     alpha, r = np.repeat(MODE_ALPHA[mode], 2), np.asarray(body.feet)
     arms = np.array([-r[0, 1], r[0, 0], -r[1, 1], r[1, 0]])
-    # Rounding 2e-16 times condition 1e3 on numbers of 1e-3.
+    # Rounding 2e-16 times condition 1e3 on values of 1e-3.
     np.testing.assert_allclose(row, DT * alpha * arms / body.inertia, rtol=0, atol=1e-15)
 
 
@@ -231,13 +233,13 @@ def test_every_figure_of_the_report_is_a_number_even_for_data_of_zeros(fit_modes
 
 
 def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contact_points():
-    config = KoopmanConfig(order=1, dataset=DatasetConfig(rollouts=10, duration=0.01))
+    few = DatasetSpec(rollouts=10, duration=0.01)
     bounding = ((0.07, -0.24), (-0.15, -0.25))
     own = ((0.2, -0.3), (-0.1, -0.3))
     feet = [bounding if mode in (Mode.FRONT, Mode.REAR) else own for mode in Mode]
     body = edmd.stack_bodies(10.0, 0.3, feet)
-    model, report = jax.jit(edmd.fit_modes, static_argnames="config")(
-        body, config, jax.random.key(0)
+    model, report = jax.jit(edmd.fit_modes, static_argnames=("dictionary", "dataset"))(
+        body, jax.random.key(0), dictionary=DictionarySpec(order=1), dataset=few
     )
     assert model.A.shape == (len(Mode), 9, 9)
     assert np.asarray(report.finite).all()
@@ -250,23 +252,19 @@ def test_fit_modes_stacks_models_over_all_contact_modes_each_with_its_own_contac
 
 
 def test_bodies_are_stacked_with_a_leading_axis():
-    config = SrbConfig(mass=10.0, inertia=0.3, feet_front=(0.2, -0.3), feet_rear=(-0.1, -0.3))
-    body = edmd.srb_params(config)
+    body = edmd.srb_params(BODY)
     np.testing.assert_array_equal(body.mass, np.full(len(Mode), 10.0))
     np.testing.assert_array_equal(body.inertia, np.full(len(Mode), 0.3))
     np.testing.assert_array_equal(body.feet, [((0.2, -0.3), (-0.1, -0.3))] * len(Mode))
 
 
 def test_a_mode_is_fitted_to_the_same_data_in_any_list_of_modes():
-    config = KoopmanConfig(dataset=DatasetConfig(rollouts=40))
-    body = edmd.srb_params(
-        SrbConfig(mass=10.0, inertia=0.3, feet_front=(0.2, -0.3), feet_rear=(-0.1, -0.3))
-    )
-    fit = jax.jit(edmd.fit_modes, static_argnames=("config", "modes"))
+    few, body = DatasetSpec(rollouts=40), edmd.srb_params(BODY)
+    fit = jax.jit(edmd.fit_modes, static_argnames=("dataset", "modes"))
     key = jax.random.key(0)
-    whole, _ = fit(body, config, key)
+    whole, _ = fit(body, key, dataset=few)
     chosen = (Mode.STAND, Mode.TROT)
-    some, _ = fit(jax.tree.map(lambda a: a[:2], body), config, key, modes=chosen)
+    some, _ = fit(jax.tree.map(lambda a: a[:2], body), key, dataset=few, modes=chosen)
     for place, mode in enumerate(chosen):
         # Vectorised over another number of modes: rounding.
         np.testing.assert_allclose(some.B[place], whole.B[mode], rtol=0, atol=1e-9)
@@ -281,5 +279,5 @@ def test_a_mode_is_fitted_to_the_same_data_in_any_list_of_modes():
         ({"constant_rotation": True}, 17),
     ],
 )
-def test_the_config_names_the_dictionary(options, size):
-    assert edmd.build_dictionary(KoopmanConfig(**options)).size == size
+def test_the_spec_names_the_dictionary(options, size):
+    assert edmd.build_dictionary(DictionarySpec(**options)).size == size

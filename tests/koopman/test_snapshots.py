@@ -1,17 +1,16 @@
 """What is said of a user's own samples before they are fitted, and how to hand them over."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.config import ConfigError, DatasetConfig, KoopmanConfig, SrbConfig
+from kjax.config import SrbConfig
 from kjax.controllers.rigid_body import own_body
 from kjax.koopman import dataset, edmd, observables
-from kjax.koopman.dataset import Snapshots
+from kjax.koopman.dataset import DatasetSpec, Snapshots
 from kjax.prediction import build, families
+from kjax.prediction.kind import ModelChoice
 from kjax.robots import go1
 from kjax.types import Mode
 
@@ -183,15 +182,18 @@ def test_no_samples_or_too_few_are_a_sentence_before_a_fit_and_in_it(data, said)
 
 
 @pytest.mark.parametrize(("model", "columns"), [("linear", 19), ("bilinear", 75)])
-def test_a_config_with_too_few_samples_names_its_keys(model, columns):
-    config = KoopmanConfig(model=model, dataset=DatasetConfig(rollouts=3, duration=0.005))
-    body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
+def test_a_dataset_of_too_few_samples_is_refused_by_name(model, columns):
+    few = DatasetSpec(rollouts=3, duration=0.005)
+    body, key = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS)), jax.random.key(0)
+    choice = ModelChoice(model=model, dataset=few)
     fit = {
-        "linear": edmd.fit_modes,
-        "bilinear": partial(build.build_prediction, modes=tuple(Mode), heights=(0.27,) * len(Mode)),
+        "linear": lambda: edmd.fit_modes(body, key, dataset=few),
+        "bilinear": lambda: build.build_prediction(
+            body, choice, key, modes=tuple(Mode), heights=(0.27,) * len(Mode)
+        ),
     }[model]
-    with pytest.raises(ConfigError, match=rf"koopman\.dataset: rollouts 3 .* {columns} regressors"):
-        fit(body, config, jax.random.key(0))
+    with pytest.raises(ValueError, match=rf"dataset: rollouts 3 .* {columns} regressors"):
+        fit()
 
 
 def test_a_ridge_may_have_fewer_samples_than_regressors():
@@ -218,7 +220,7 @@ def test_a_family_refuses_delay_coordinates(family):
 
 
 def cut(data, lengths):
-    """Episodes of these numbers of steps, from rollouts."""
+    """Episodes of these lengths, from rollouts."""
     return [
         (data.states[i, : n + 1], data.inputs[i, :n], data.feet[i]) for i, n in enumerate(lengths)
     ]

@@ -12,8 +12,9 @@ from kjax.config import RunConfig, load_config
 from kjax.config.units import in_si
 from kjax.controllers.resolve import multiphase_params
 from kjax.controllers.walkable import build_gaits, cycle_nodes
-from kjax.mpc import multiphase
+from kjax.mpc import horizon, multiphase
 from kjax.robots import go1
+from kjax.spec import CycleSpec
 from kjax.types import GRAVITY, Leg
 
 COUNT = 15
@@ -52,7 +53,7 @@ def config():
 @pytest.fixture(scope="module")
 def params(config):
     params = multiphase_params(build_gaits(config), in_si(config, go1.PARAMS), go1.PARAMS)
-    return multiphase.for_gait(params, jnp.asarray(BOUND))
+    return horizon.for_gait(params, jnp.asarray(BOUND))
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def clock_at(phase, elapsed, cycle=10):
 
 def nodes_at(params, schedule, phase, elapsed, cycle=10):
     clock = clock_at(phase, elapsed, cycle)
-    return multiphase.build_nodes(params, schedule, clock, COUNT, 0.0025)
+    return horizon.build_nodes(params, schedule, clock, COUNT, 0.0025)
 
 
 @pytest.fixture(scope="module")
@@ -75,20 +76,24 @@ def forecast_of(params):
     """Forecast for given nodes, state and command, on flat ground."""
 
     def build(nodes, x, velocity=0.0, command=0.0, slew=2.0, contact=((0.05, 0.0), (-0.1, 0.0))):
-        return multiphase.predict(
+        return horizon.predict(
             params,
             nodes,
             x,
-            position=x[0],
-            velocity=jnp.asarray(velocity),
-            command=jnp.asarray(command),
-            slew=jnp.asarray(slew),
-            height=jnp.asarray(0.27),
-            ground=jnp.asarray(0.0),
-            periodic=jnp.zeros((COUNT, 4)),
-            contact=jnp.asarray(contact),
-            stance_time=jnp.asarray(DURATION)[nodes.phase],
-            cycle_time=jnp.asarray(0.35),
+            horizon.HorizonCommand(
+                position=x[0],
+                velocity=jnp.asarray(velocity),
+                target=jnp.asarray(command),
+                slew=jnp.asarray(slew),
+                height=jnp.asarray(0.27),
+                periodic=jnp.zeros((COUNT, 4)),
+            ),
+            horizon.Stances(
+                ground=jnp.asarray(0.0),
+                feet=jnp.asarray(contact),
+                duration=jnp.asarray(DURATION)[nodes.phase],
+                cycle=jnp.asarray(0.35),
+            ),
         )
 
     return build
@@ -225,9 +230,9 @@ def test_torque_rows_are_c_mujocos_jacobian(params, schedule, forecast_of, plana
         point = data.geom_xpos[geom]
         mujoco.mj_jac(planar_go1, data, jacobian, None, point, planar_go1.geom_bodyid[geom])
         J = jacobian[[0, 2]][:, dofs]
-        miss = target - point[[0, 2]]
-        data.qpos[joints] += np.linalg.solve(J, np.clip(miss, -0.02, 0.02))
-    assert np.abs(miss).max() < 1e-9
+        error = target - point[[0, 2]]
+        data.qpos[joints] += np.linalg.solve(J, np.clip(error, -0.02, 0.02))
+    assert np.abs(error).max() < 1e-9
     np.testing.assert_allclose(rows[0, 2:], J.T, atol=1e-6)
 
 
@@ -239,11 +244,11 @@ def plan(params, schedule, forecast_of):
     forecast = forecast_of(nodes, x, velocity=0.3, command=1.0)
     lever = jnp.array([0.0, -0.018])
 
+    spec = CycleSpec(nodes=COUNT - 1, tolerance=1e-9, max_iterations=40)
+
     @jax.jit
     def solve(params):
-        return multiphase.solve(
-            params, go1.PARAMS, nodes, forecast, x, lever, tolerance=1e-9, max_iterations=40
-        )
+        return multiphase.solve(params, go1.PARAMS, nodes, forecast, x, lever, spec)
 
     rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, forecast, lever)
     return solve, nodes, forecast, rows, limit

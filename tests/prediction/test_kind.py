@@ -5,16 +5,17 @@ import numpy as np
 import pytest
 
 from kjax import ConfigError, RunConfig, build_controller, condense, load_config, resolve
+from kjax.controllers.resolve import controller_spec
 from kjax.legs.posture import stand_pose, standing
 from kjax.prediction import families
-from kjax.prediction.build import build_family, model_spec
+from kjax.prediction.build import build_family
 from kjax.prediction.kind import ModelKind, get_kind, model_kinds
 from kjax.robots import go1
 
 # The rigid body again, under another name: its plans must be those of "srb".
 OWN = ModelKind(
     family=lambda spec: families.rigid_body(spec.dt),
-    params=lambda config, bodies: (
+    params=lambda choice, bodies: (
         families.BodyModel(bodies.body, bodies.alpha), jnp.zeros((len(bodies.modes), 6))
     ),
     is_body=True,
@@ -55,7 +56,7 @@ def test_a_kind_of_ones_own_plans_as_one_of_kjax(monkeypatch):
         keys = {"koopman.model": name, "lmpc.model_dt": 0.02, "lmpc.horizon": 4}
         config = load_config(RunConfig, None, keys | {"sim.base": "planar"})
         assert get_kind(name).is_body
-        assert build_family(model_spec(config.koopman)).name == "srb"
+        assert build_family(controller_spec(config).model).name == "srb"
         spec, params = resolve(config)
         controller, tables = build_controller(spec), condense(spec, params)
         seen = standing(jnp.asarray(stand_pose(go1.PARAMS, 0.265)[1]))

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.config import KoopmanConfig, SrbConfig
+from kjax.config import SrbConfig
 from kjax.controllers.rigid_body import own_body
 from kjax.koopman import edmd, observables
 from kjax.koopman.dataset import Snapshots
 from kjax.koopman.observables import custom_dictionary
 from kjax.prediction import build, families, learned, storage
+from kjax.prediction.kind import ModelChoice
 from kjax.robots import go1
 from kjax.types import Mode
 
@@ -111,11 +112,11 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     storage.save(path, storage.Stored("learned", 1e-3, model, spread))
     back = storage.load(path, "learned")
     jax.tree.map(np.testing.assert_array_equal, back.params, model)
-    config = KoopmanConfig(model="learned", file=str(path))
-    assert build.build_family(build.model_spec(config)).size == 8
+    choice = ModelChoice(model="learned", file=str(path))
+    assert build.build_family(build.model_spec(choice)).size == 8
     body = edmd.srb_params(own_body(SrbConfig(), go1.PARAMS))
     built = build.build_prediction(
-        body, config, jax.random.key(0), modes=tuple(Mode), heights=(0.27,) * len(Mode)
+        body, choice, jax.random.key(0), modes=tuple(Mode), heights=(0.27,) * len(Mode)
     )
     np.testing.assert_array_equal(built.spread, spread)
 
@@ -125,8 +126,8 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     [
         ({"family": "residual"}, "holds residual, wanted a learned model"),
         ({"A": None}, "lacks 'A'"),
-        ({"centre": np.full((len(Mode), 6), np.nan)}, "centre holds numbers that are not finite"),
-        ({"dt": 0.005}, "steps of 0.005 s, koopman.dataset.dt is 0.001 s"),
+        ({"centre": np.full((len(Mode), 6), np.nan)}, "centre holds values that are not finite"),
+        ({"dt": 0.005}, "steps of 0.005 s, dataset.dt is 0.001 s"),
         ({"spread": np.zeros((3, 6))}, f"holds 3 contact modes, wanted {len(Mode)}"),
     ],
 )
@@ -138,19 +139,19 @@ def test_a_file_that_is_no_such_model_is_refused(trained, tmp_path, change, mess
     arrays = {**np.load(path), **change}
     np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
     with pytest.raises(ValueError, match=message):
-        build.model_spec(KoopmanConfig(model="learned", file=str(path)))
+        build.model_spec(ModelChoice(model="learned", file=str(path)))
 
 
 def test_a_file_that_is_not_there_or_no_file_at_all(tmp_path):
-    with pytest.raises(ValueError, match=r"koopman\.file: cannot read"):
+    with pytest.raises(ValueError, match=r"file: cannot read"):
         storage.load(tmp_path / "none.npz", "residual")
     (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(ValueError, match=r"koopman\.file: cannot read"):
+    with pytest.raises(ValueError, match=r"file: cannot read"):
         storage.load(tmp_path / "text.npz", "residual")
     with pytest.raises(ValueError, match="model = 'residual' needs a file"):
-        build.model_spec(KoopmanConfig(model="residual"))
+        build.model_spec(ModelChoice(model="residual"))
     with pytest.raises(ValueError, match="model = 'exact' takes no file"):
-        build.model_spec(KoopmanConfig(model="exact", file="a.npz"))
+        build.model_spec(ModelChoice(model="exact", file="a.npz"))
 
 
 def test_weights_of_unknown_features_are_refused(tmp_path):
@@ -275,7 +276,7 @@ def put(index, value):
     ("changes", "message"),
     [
         ({"states": put((3, 7, 2), np.nan)}, "states: 1 of 6 rollouts.*the first one is rollout 3"),
-        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold numbers that are not"),
+        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold values that are not"),
         ({"states": lambda a: a[..., :5]}, r"states: got shape \(6, 21, 5\), wanted"),
         ({"inputs": lambda a: a[:, :-1]}, r"inputs: got shape \(6, 19, 4\), wanted \(6, 20, 4\)"),
         ({"feet": lambda a: a[:1]}, r"feet: got shape \(1, 2, 2\), wanted \(6, 2, 2\)"),

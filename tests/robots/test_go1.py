@@ -170,15 +170,15 @@ def test_the_default_rigid_body_is_the_go1():
     assert body.mass == go1.PARAMS.mass
     assert body.inertia == go1.PARAMS.pitch_inertia
     own = own_body(SrbConfig(mass=9.0, feet_rear=(-0.2, -0.25)), go1.PARAMS)
-    assert (own.mass, own.feet_rear) == (9.0, (-0.2, -0.25))
-    assert (own.inertia, own.feet_front) == (body.inertia, body.feet_front)
+    assert (own.mass, own.inertia) == (9.0, body.inertia)
+    np.testing.assert_array_equal(own.feet, [body.feet[0], (-0.2, -0.25)])
 
 
 def test_the_default_contact_points_lie_below_the_hips(planar_go1, standing):
     """The soles of MuJoCo's feet, seen from its centre of mass."""
     com = standing.subtree_com[planar_go1.body("trunk").id]
     body = own_body(SrbConfig(), go1.PARAMS)
-    for point, leg in ((body.feet_front, "FR"), (body.feet_rear, "RR")):
+    for point, leg in zip(body.feet, ("FR", "RR"), strict=True):
         sole = standing.geom(f"{leg}_foot").xpos - com - [0.0, 0.0, go1.FOOT_RADIUS]
         # The pose is solved to 1e-12 m.
         np.testing.assert_allclose(point, sole[[0, 2]], rtol=0, atol=1e-10)

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kjax.config import KoopmanConfig, SrbConfig
+from kjax.config import SrbConfig
 from kjax.controllers.rigid_body import own_body
 from kjax.dynamics import srb_planar
-from kjax.koopman import edmd, observables
-from kjax.koopman.dataset import SampleRanges, Snapshots, ranges_from_config, sample
+from kjax.koopman import observables
+from kjax.koopman.dataset import DatasetSpec, SampleRanges, Snapshots, sample, sample_ranges
 from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
@@ -37,14 +37,14 @@ class Setting(NamedTuple):
 
 def setting() -> Setting:
     """Trot, Go1, and the ranges that the controller's models are fitted on."""
-    config, body = KoopmanConfig().dataset, own_body(SrbConfig(), get_robot().params)
+    dataset, body = DatasetSpec(), own_body(SrbConfig(), get_robot().params)
     return Setting(
-        body=jax.tree.map(lambda leaf: leaf[Mode.TROT], edmd.srb_params(body)),
+        body=jax.tree.map(jnp.asarray, body),
         alpha=jnp.asarray(MODE_ALPHA[Mode.TROT], float),
-        ranges=ranges_from_config(config, vary_feet=False),
-        rollouts=config.rollouts,
-        steps=round(config.duration / config.dt),
-        dt=config.dt,
+        ranges=sample_ranges(dataset),
+        rollouts=dataset.rollouts,
+        steps=dataset.steps,
+        dt=dataset.dt,
     )
 
 

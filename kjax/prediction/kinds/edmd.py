@@ -1,6 +1,6 @@
 """Models fitted to rollouts of the rigid body: linear (the paper's) and bilinear EDMD."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,23 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from kjax.config import KoopmanConfig
 from kjax.dynamics.srb_planar import SrbParams
 from kjax.koopman.checks import require_dataset
-from kjax.koopman.dataset import ranges_from_config, sample
+from kjax.koopman.dataset import sample, sample_ranges
 from kjax.koopman.edmd import build_dictionary, fit_bilinear
 from kjax.prediction import families
 from kjax.prediction.families import Family
-from kjax.prediction.kind import Bodies, ModelKind
-from kjax.spec import DictionarySpec, ModelSpec
+from kjax.prediction.kind import Bodies, ModelChoice, ModelKind
+from kjax.spec import ModelSpec
 from kjax.types import INPUT_DIM, MODE_ALPHA, Mode
 
 
-def _spec(config: KoopmanConfig, spec: ModelSpec) -> ModelSpec:
-    names = [field.name for field in fields(DictionarySpec)]
-    return replace(
-        spec, dictionary=DictionarySpec(**{name: getattr(config, name) for name in names})
-    )
+def _spec(choice: ModelChoice, spec: ModelSpec) -> ModelSpec:
+    return replace(spec, dictionary=choice.dictionary)
 
 
 def _family(build: Any, spec: ModelSpec) -> Family:
@@ -35,26 +31,25 @@ def _family(build: Any, spec: ModelSpec) -> Family:
     return family
 
 
-def _bilinear(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
-    params, spread, finite = _fit_bilinear(bodies.body, config, bodies.key, bodies.modes)
+def _bilinear(choice: ModelChoice, bodies: Bodies) -> tuple[Any, Any]:
+    params, spread, finite = _fit_bilinear(bodies.body, choice, bodies.key, bodies.modes)
     if not bool(finite):
-        raise ValueError("the bilinear fit is not finite: check srb and koopman.dataset ranges")
+        raise ValueError("dataset: the bilinear fit is not finite, check its ranges and the body")
     return params, spread
 
 
-@partial(jax.jit, static_argnames=("config", "modes"))
+@partial(jax.jit, static_argnames=("choice", "modes"))
 def _fit_bilinear(
-    body: SrbParams, config: KoopmanConfig, key: Array, modes: tuple[Mode, ...]
+    body: SrbParams, choice: ModelChoice, key: Array, modes: tuple[Mode, ...]
 ) -> tuple[Any, Any, Any]:
-    dictionary, data = build_dictionary(config), config.dataset
-    measured = config.feet == "measured"
-    require_dataset(data, dictionary.size * (1 + INPUT_DIM) + (8 if measured else 0))
+    dictionary, dataset = build_dictionary(choice.dictionary), choice.dataset
+    measured = choice.measured_feet
+    require_dataset(dataset, dictionary.size * (1 + INPUT_DIM) + (8 if measured else 0))
 
     def one(key: Array, alpha: Array, body: SrbParams) -> tuple[Any, Any]:
-        ranges = ranges_from_config(data, vary_feet=measured)
         snapshots = sample(
-            key, body, alpha, ranges, rollouts=data.rollouts,
-            steps=round(data.duration / data.dt), dt=data.dt, hold=data.hold,
+            key, body, alpha, sample_ranges(dataset, vary_feet=measured),
+            rollouts=dataset.rollouts, steps=dataset.steps, dt=dataset.dt, hold=dataset.hold,
         )  # fmt: skip
         return fit_bilinear(dictionary, snapshots, feet_terms=measured)
 

@@ -5,23 +5,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from kjax.config import KoopmanConfig
 from kjax.koopman.observables import states_only
 from kjax.prediction import families
 from kjax.prediction.families import BodyModel
-from kjax.prediction.kind import Bodies, ModelKind
+from kjax.prediction.kind import Bodies, ModelChoice, ModelKind
 from kjax.types import STATE_DIM
 
 
-def _hover(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
+def _hover(choice: ModelChoice, bodies: Bodies) -> tuple[Any, Any]:
     def one(body: Any, alpha: Any, height: Any) -> Any:
-        return families.linearised_srb(body, alpha, height, config.dataset.dt)
+        return families.linearised_srb(body, alpha, height, choice.dataset.dt)
 
     heights = jnp.asarray(bodies.heights, float)
     return jax.vmap(one)(bodies.body, bodies.alpha, heights), _certain(bodies)
 
 
-def _body(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
+def _body(choice: ModelChoice, bodies: Bodies) -> tuple[Any, Any]:
     return BodyModel(bodies.body, bodies.alpha), _certain(bodies)
 
 

@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kjax.config import ConfigError, KoopmanConfig
 from kjax.koopman.observables import states_only
 from kjax.prediction import families, features, storage
 from kjax.prediction.families import BodyModel, Family, ResidualModel
-from kjax.prediction.kind import Bodies, ModelKind
+from kjax.prediction.kind import Bodies, ModelChoice, ModelKind
 from kjax.prediction.learned import learned
 from kjax.spec import ModelSpec
 
@@ -23,34 +22,34 @@ def _residual_family(spec: ModelSpec) -> Family:
     return families.residual(spec.dt, own, remembers=spec.features != "affine")
 
 
-def _residual(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
-    own, spread = _of_modes(config, bodies)
+def _residual(choice: ModelChoice, bodies: Bodies) -> tuple[Any, Any]:
+    own, spread = _of_modes(choice, bodies)
     return ResidualModel(BodyModel(bodies.body, bodies.alpha), own), spread
 
 
-def _of_modes(config: KoopmanConfig, bodies: Bodies) -> tuple[Any, Any]:
-    stored, chosen = _stored(config), np.array(bodies.modes)
+def _of_modes(choice: ModelChoice, bodies: Bodies) -> tuple[Any, Any]:
+    stored, chosen = _stored(choice), np.array(bodies.modes)
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[chosen], stored.params)
     return own, jnp.asarray(stored.spread)[chosen]
 
 
-def _lifted(config: KoopmanConfig, spec: ModelSpec) -> ModelSpec:
-    size = _stored(config).params.head.A.shape[-1]
+def _lifted(choice: ModelChoice, spec: ModelSpec) -> ModelSpec:
+    size = _stored(choice).params.head.A.shape[-1]
     return replace(spec, lifted=size - len(states_only().names))
 
 
-def _stored(config: KoopmanConfig) -> storage.Stored:
-    path = storage.resolve(config.file)
+def _stored(choice: ModelChoice) -> storage.Stored:
+    path = storage.resolve(choice.file)
     try:
         content = path.stat()
         changed = (content.st_mtime_ns, content.st_size, content.st_ino)
     except OSError:
         changed = (0, 0, 0)
-    stored = _read(path, config.model, changed)
-    if abs(stored.dt - config.dataset.dt) > 1e-9:
-        raise ConfigError(
-            f"koopman.file: '{path}' holds a model of steps of {stored.dt} s, koopman.dataset.dt "
-            f"is {config.dataset.dt} s"
+    stored = _read(path, choice.model, changed)
+    if abs(stored.dt - choice.dataset.dt) > 1e-9:
+        raise ValueError(
+            f"file: '{path}' holds a model of steps of {stored.dt} s, dataset.dt is "
+            f"{choice.dataset.dt} s"
         )
     return stored
 
@@ -63,7 +62,7 @@ def _read(path: Path, family: str, changed: tuple[int, int, int]) -> storage.Sto
 RESIDUAL = ModelKind(
     family=_residual_family,
     params=_residual,
-    spec=lambda config, spec: replace(spec, features=_stored(config).features),
+    spec=lambda choice, spec: replace(spec, features=_stored(choice).features),
     takes_file=True,
 )
 LEARNED = ModelKind(

@@ -11,10 +11,11 @@ import numpy as np
 from kjax.config import Gaits, RunConfig, SrbConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.controllers.resolve import fit_models
+from kjax.controllers.resolve_model import resolve_model
 from kjax.controllers.rigid_body import own_body
 from kjax.controllers.walkable import build_gaits, contact_problems
 from kjax.dynamics import srb_planar
-from kjax.prediction.build import build_family, model_spec
+from kjax.prediction.build import build_family
 from kjax.prediction.features import Features, affine
 from kjax.robots import get_robot
 from kjax.studies.prediction_models import MODELS, residual
@@ -113,7 +114,7 @@ def compare(gait: str, held: Transitions, folder: Path, quick: bool) -> dict[str
         config, problem = _within_stance(config)
         with jax.enable_x64(True):
             fits = fit_models(config, get_robot(config.robot).params)
-            family = build_family(model_spec(config.koopman))
+            family = build_family(resolve_model(config.koopman))
             fits = jax.tree.map(lambda a, at=problem: a[at], fits)
             own = fits.model if fits.prediction is None else fits.prediction.params
             force = np.zeros((len(Mode), 4)) if fits.prediction is None else fits.prediction.force
@@ -150,10 +151,8 @@ def _within_stance(config: RunConfig) -> tuple[RunConfig, np.ndarray]:
 
 def nominal_body() -> srb_planar.SrbParams:
     """The robot's rigid body; where the feet are comes from the recordings."""
-    config = own_body(SrbConfig(), get_robot().params)
-    return srb_planar.SrbParams(
-        mass=jnp.asarray(config.mass), inertia=jnp.asarray(config.inertia), feet=jnp.zeros((2, 2))
-    )
+    body = own_body(SrbConfig(), get_robot().params)
+    return jax.tree.map(jnp.asarray, body._replace(feet=jnp.zeros((2, 2))))
 
 
 def predicted_errors(
