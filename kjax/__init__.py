@@ -13,21 +13,15 @@ from kjax.controllers.controller import Controller, build_controller
 from kjax.controllers.observation import check_observation
 from kjax.controllers.params import ControllerParams, Tables, condense
 from kjax.controllers.resolve import resolve
-from kjax.moved import install_moved_finder
+from kjax.moved import install_moved_finder, moved_names
 from kjax.spec import ControllerSpec
 from kjax.types import Command, JointCommand, Leg, Mode, Observation
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 install_moved_finder()
 
-_MOVED = {"build_params": "resolve(config, robot), then condense(spec, params)"}
-
-
-def __getattr__(name: str) -> object:
-    if name in _MOVED:
-        raise ImportError(f"kjax.{name} has gone: use {_MOVED[name]}")
-    raise AttributeError(f"module 'kjax' has no attribute '{name}'")
+__getattr__ = moved_names(__name__)
 
 
 __all__ = [

@@ -1,7 +1,7 @@
-"""What has become of modules of earlier versions: importing one says where its content is now."""
+"""What has become of modules and names of earlier versions: importing one gives the new one."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
@@ -30,6 +30,32 @@ MOVED = {
     "kjax.sim.mjx_loop": "kjax.sim.engines.mjx",
     "kjax.sim.mujoco_loop": "kjax.sim.engines.mujoco",
     "kjax.sim.walk": "kjax.sim.closed_loop",
+    "kjax.sim.push": "kjax.sim.resolve",
+}
+
+_GAIT = "kjax.config.gaits.LIBRARY['{}']: gaits are data, their phases gait.phases(...)"
+# Module -> old name -> what to use now.
+NAMES = {
+    "kjax": {"build_params": "resolve(config, robot), then condense(spec, params)"},
+    "kjax.config": {"BoundConfig": "GaitConfig, and config.gaits.LIBRARY['bound']: gaits are data"},
+    "kjax.gait": {name: _GAIT.format(name) for name in ("trot", "bound", "stand")},
+    "kjax.koopman.observables": {"own": "custom_dictionary"},
+    "kjax.koopman.dataset": {"ranges_from_config": "sample_ranges(DatasetSpec(...))"},
+    "kjax.sim.episode": {
+        **dict.fromkeys(("Trajectory", "sagittal"), "kjax.sim.trajectory"),
+        **dict.fromkeys(
+            ("metrics", "metric_names", "foot_slip", "reference_height", "SETTLE_TIME"),
+            "kjax.sim.metrics",
+        ),
+        **dict.fromkeys(("FALL_HEIGHT", "FALL_TILT"), "kjax.sim.closed_loop"),
+    },
+    "kjax.sim.resolve": {
+        "push_at": "kjax.sim.episode.push_at",
+        "stack_episodes": "kjax.sim.episode.stack_params(episodes)",
+        "stack_tables": "kjax.sim.batching.stack_tables(episodes, dtype)",
+    },
+    "kjax.sim.scene": {"apply_scene": "apply_world(robot, model, resolve_world(config))"},
+    "kjax.sim.excitation": dict.fromkeys(("force_noise", "force_deviation"), "kjax.sim.noise"),
 }
 
 
@@ -50,3 +76,15 @@ def install_moved_finder() -> None:
     """Let imports of old modules fail with the new name."""
     if MovedFinder not in sys.meta_path:
         sys.meta_path.append(MovedFinder)
+
+
+def moved_names(module: str) -> Callable[[str], object]:
+    """``__getattr__`` of a module: an ImportError with the new name of an old one."""
+
+    def find(name: str) -> object:
+        new = NAMES[module].get(name)
+        if new is None:
+            raise AttributeError(f"module '{module}' has no attribute '{name}'")
+        raise ImportError(f"{module}.{name} has gone: use {new}", name=module)
+
+    return find

@@ -8,7 +8,7 @@ import zipfile
 import pytest
 
 import kjax
-from kjax.moved import MOVED
+from kjax.moved import MOVED, NAMES
 
 
 @pytest.mark.slow
@@ -35,12 +35,18 @@ def test_a_public_name_that_has_gone_gives_the_new_one():
     assert not hasattr(kjax, "nothing_of_that_name")
 
 
-def test_a_module_that_has_moved_gives_the_new_one():
+def test_modules_and_names_that_have_moved_give_the_new_ones():
     for old, new in MOVED.items():
         with pytest.raises(ImportError, match=rf"^{old} has moved: import {new}$"):
             importlib.import_module(old)
         assert importlib.util.find_spec(new) is not None
     with pytest.raises(ImportError, match=r"kjax\.sweep has moved: import kjax\.runs\.sweeps"):
         importlib.import_module("kjax.sweep.runner")
+    for module, names in NAMES.items():
+        for old, new in names.items():
+            with pytest.raises(ImportError) as error:
+                getattr(importlib.import_module(module), old)
+            assert str(error.value) == f"{module}.{old} has gone: use {new}"
+        assert not hasattr(importlib.import_module(module), "nothing_of_that_name")
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module("kjax.nothing_of_that_name")

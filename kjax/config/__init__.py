@@ -18,6 +18,7 @@ from kjax.config.model import DatasetConfig, KoopmanConfig, SrbConfig
 from kjax.config.run import FitStudyConfig, RunConfig
 from kjax.config.simulation import NoiseConfig, PushConfig, SimConfig, TerrainConfig
 from kjax.config.sweep import AxisConfig, FigureConfig, SweepConfig
+from kjax.moved import moved_names
 
 __all__ = [
     "AxisConfig",
@@ -50,10 +51,4 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> object:
-    if name == "BoundConfig":
-        raise ImportError(
-            "kjax.config.BoundConfig has gone: gaits are data, kjax.config.GaitConfig and "
-            "kjax.config.gaits.LIBRARY['bound']"
-        )
-    raise AttributeError(f"module 'kjax.config' has no attribute '{name}'")
+__getattr__ = moved_names(__name__)

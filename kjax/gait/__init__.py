@@ -15,6 +15,7 @@ from kjax.gait.schedule import (
     start,
     time_to_touchdown,
 )
+from kjax.moved import moved_names
 
 __all__ = [
     "Clock",
@@ -32,13 +33,4 @@ __all__ = [
     "time_to_touchdown",
 ]
 
-_GONE = ("trot", "bound", "stand")
-
-
-def __getattr__(name: str) -> object:
-    if name in _GONE:
-        raise ImportError(
-            f"kjax.gait.{name} has gone: gaits are data, kjax.config.gaits.LIBRARY['{name}']; "
-            "their phases are gait.phases(period, offset, duty)"
-        )
-    raise AttributeError(f"module 'kjax.gait' has no attribute '{name}'")
+__getattr__ = moved_names(__name__)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax.dynamics import srb_planar
+from kjax.moved import moved_names
 from kjax.types import INPUT_DIM, STATE_DIM
 
 _PIECE = 256  # rollouts that are integrated side by side
@@ -220,9 +221,4 @@ def _episode(number: int, episode: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
     return states, inputs, feet
 
 
-def __getattr__(name: str) -> object:
-    if name == "ranges_from_config":
-        raise ImportError(
-            "kjax.koopman.dataset.ranges_from_config(config) is now sample_ranges(DatasetSpec(...))"
-        )
-    raise AttributeError(f"module 'kjax.koopman.dataset' has no attribute '{name}'")
+__getattr__ = moved_names(__name__)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from kjax.moved import moved_names
 from kjax.types import STATE_DIM, STATE_NAMES, STATE_UNITS
 
 # Column of the first state in every dictionary: the constant comes before it.
@@ -206,7 +207,4 @@ def _dictionary(
     )
 
 
-def __getattr__(name: str) -> object:
-    if name == "own":
-        raise ImportError("kjax.koopman.observables.own is now custom_dictionary")
-    raise AttributeError(f"module 'kjax.koopman.observables' has no attribute '{name}'")
+__getattr__ = moved_names(__name__)

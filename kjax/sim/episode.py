@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from kjax.controllers.params import ControllerParams
+from kjax.moved import moved_names
 from kjax.sim.observe import Addresses
 from kjax.sim.terrain import Terrain
 from kjax.spec import ControllerSpec
@@ -229,3 +230,6 @@ def stack_params(episodes: Sequence[Episode]) -> EpisodeParams:
         return params._replace(**lists)
 
     return jax.tree.map(lambda *leaves: np.stack(leaves), *(filled(one.params) for one in episodes))
+
+
+__getattr__ = moved_names(__name__)

@@ -9,6 +9,8 @@ planned it.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from kjax.moved import moved_names
+
 
 def perturb(
     force: Float[Array, "4 3"], stance: Bool[Array, "4"], noise: Float[Array, "4"]
@@ -24,3 +26,6 @@ def perturb(
     added = jnp.asarray(force).at[:, ::2].add(noise)
     added = added.at[:, 2].max(0.0)
     return jnp.where(stance[:, None], added, force)
+
+
+__getattr__ = moved_names(__name__)

@@ -39,6 +39,10 @@ def metrics(run: Trajectory, goal: Goal) -> dict[str, Any]:
       run: the episode.
       goal: what was asked in it.
     """
+    if not isinstance(goal, Goal):
+        raise TypeError(
+            f"goal: wanted kjax.sim.resolve.resolve_goal(config), got {type(goal).__name__}"
+        )
     steady = run.time >= SETTLE_TIME
     result: dict[str, Any] = {
         "fell": run.fell,

@@ -15,6 +15,7 @@ from kjax.controllers.resolve import build_command, controller_key, controller_s
 from kjax.controllers.walkable import build_gaits
 from kjax.files import file_hashes
 from kjax.legs.posture import stand_pose
+from kjax.moved import moved_names
 from kjax.robots import get_robot
 from kjax.sim import free_base
 from kjax.sim.episode import (
@@ -239,3 +240,6 @@ def _controller(config: RunConfig) -> ControllerParams:
             _controllers.pop(next(iter(_controllers)))
         _controllers[key] = resolve(config)[1]
     return _controllers[key]
+
+
+__getattr__ = moved_names(__name__)

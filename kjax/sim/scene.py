@@ -6,6 +6,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from kjax.moved import moved_names
 from kjax.robots import Robot
 from kjax.sim.episode import SceneSpec, World
 from kjax.sim.observe import Addresses, find_addresses
@@ -28,6 +29,11 @@ def build_spec(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoco
       visual: whether to make it fit to look at; textures are 97 % of the compiled model, which a
         batch holds once per robot.
     """
+    if not isinstance(scene, SceneSpec):
+        raise TypeError(
+            f"scene: wanted the SceneSpec of kjax.sim.resolve.resolve_scene(config), got "
+            f"{type(scene).__name__}"
+        )
     spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
     spec.option.timestep = scene.sim_dt
     spec.option.cone = _CONES[scene.cone]
@@ -138,3 +144,6 @@ def _add_looks(spec: mujoco.MjSpec, trunk: str) -> None:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 720
     spec.stat.center = np.array([0.0, 0.0, 0.2])
     spec.stat.extent = 1.0
+
+
+__getattr__ = moved_names(__name__)

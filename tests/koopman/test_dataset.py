@@ -136,5 +136,5 @@ def test_a_scan_over_ranges_is_a_vmap(sampler, ranges):
 
 
 def test_the_old_name_of_sample_ranges_says_the_new_one():
-    with pytest.raises(ImportError, match="is now sample_ranges"):
+    with pytest.raises(ImportError, match="has gone: use sample_ranges"):
         from kjax.koopman.dataset import ranges_from_config  # noqa: F401

@@ -92,5 +92,5 @@ def test_a_negative_order_is_refused_by_name():
 
 def test_the_old_name_of_custom_dictionary_says_the_new_one():
     # An AttributeError would be swallowed by the import statement.
-    with pytest.raises(ImportError, match="is now custom_dictionary"):
+    with pytest.raises(ImportError, match="has gone: use custom_dictionary"):
         from kjax.koopman.observables import own  # noqa: F401

@@ -76,8 +76,12 @@ def check_delay(spec: BatchSpec, params: EpisodeParams, torques: Torques) -> Non
         )
 
 
-def require_torques(torques: str) -> None:
-    """Refuse a name that is no ``Torques``."""
+def require_options(spec: BatchSpec, torques: str) -> None:
+    """Refuse what is no spec, and a name that is no ``Torques``."""
+    if not isinstance(spec, BatchSpec):
+        raise TypeError(
+            f"spec: wanted kjax.sim.resolve.batch_spec(config), got {type(spec).__name__}"
+        )
     if torques not in ("every_step", "held"):
         raise ValueError(f"torques must be 'every_step' or 'held', got {torques!r}")
 

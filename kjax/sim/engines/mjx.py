@@ -25,7 +25,7 @@ from kjax.sim.engines.contract import (
     Torques,
     check_delay,
     require_one_batch,
-    require_torques,
+    require_options,
 )
 from kjax.sim.engines.mujoco_batch import scene_models
 from kjax.sim.episode import (
@@ -103,7 +103,7 @@ class MjxEngine:
           dtype: floating type of controller and physics; float64 needs ``jax_enable_x64``.
           impl: implementation of MJX, e.g. ``"warp"`` on an NVIDIA GPU; its own choice if ``None``.
         """
-        require_torques(torques)
+        require_options(spec, torques)
         self.spec, self.torques, self.dtype = spec, torques, np.dtype(dtype)
         self.model = build_model(spec.scene)
         self.traces = 0

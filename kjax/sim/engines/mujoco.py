@@ -12,7 +12,7 @@ import numpy as np
 
 from kjax.robots import get_robot
 from kjax.sim.closed_loop import TickLog
-from kjax.sim.engines.contract import OnProgress, Torques, require_one_spec, require_torques
+from kjax.sim.engines.contract import OnProgress, Torques, require_one_spec, require_options
 from kjax.sim.episode import BatchSpec, Episode, EpisodeParams, initial_state, push_at
 from kjax.sim.noise import force_noise, noise_dim, sensor_noise
 from kjax.sim.observe import build_observe, find_addresses
@@ -60,7 +60,7 @@ class MujocoEngine:
           threads: of no effect: one robot walks at a time.
           dtype: floating type of the controller; JAX's default if ``None``.
         """
-        require_torques(torques)
+        require_options(spec, torques)
         self.spec, self.torques, self._dtype = spec, torques, dtype
         self.robot = get_robot(spec.scene.robot)
         self.model = build_model(self.robot, spec.scene)

@@ -31,7 +31,7 @@ from kjax.sim.engines.contract import (
     Torques,
     check_delay,
     require_one_batch,
-    require_torques,
+    require_options,
 )
 from kjax.sim.episode import (
     BatchSpec,
@@ -91,7 +91,7 @@ class BatchEngine:
           threads: as many as this process may use cores if ``None``.
           dtype: floating type of the controller.
         """
-        require_torques(torques)
+        require_options(spec, torques)
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}")
         self.spec, self.torques, self.dtype = spec, torques, np.dtype(dtype)
