@@ -1,6 +1,7 @@
 """The wheel that users install."""
 
 import importlib
+import re
 import subprocess
 import sys
 import zipfile
@@ -33,6 +34,12 @@ def test_a_public_name_that_has_gone_gives_the_new_one():
     with pytest.raises(ImportError, match=r"kjax\.build_params has gone: use resolve\(config"):
         from kjax import build_params  # noqa: F401
     assert not hasattr(kjax, "nothing_of_that_name")
+
+
+def test_every_equation_of_the_paper_is_found_by_its_number(repository):
+    sources = "".join(path.read_text("utf-8") for path in (repository / "kjax").rglob("*.py"))
+    missing = [n for n in range(1, 19) if not re.search(rf"Eq\. {n}\b", sources)]
+    assert missing == []
 
 
 def test_modules_and_names_that_have_moved_give_the_new_ones():

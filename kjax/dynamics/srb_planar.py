@@ -1,4 +1,4 @@
-"""Planar single rigid body with forces at the front and the rear feet (Eqs. 1-2 of the paper).
+"""Planar single rigid body with forces at the front and the rear feet (Eq. 1 and Eq. 2 of the paper).
 
     p'' = R(theta) (alpha_f F_f + alpha_r F_r) / m - g
     theta'' = (r_f x alpha_f F_f + r_r x alpha_r F_r) / I
@@ -40,7 +40,7 @@ def planar_rotation(theta: Float[Array, ""]) -> Float[Array, "2 2"]:
 def dynamics(
     params: SrbParams, alpha: Float[Array, "2"], x: Float[Array, "6"], u: Float[Array, "4"]
 ) -> Float[Array, "6"]:
-    """Time derivative of the state (Eqs. 1-2).
+    """Time derivative of the state (Eq. 1 and Eq. 2).
 
     Args:
       params: body parameters.

@@ -1,4 +1,4 @@
-"""Linear Koopman predictors  Pi(x_{t+1}) = A Pi(x_t) + B(r) u_t.
+"""Linear Koopman predictors  Pi(x_{t+1}) = A Pi(x_t) + B(r) u_t  (Eq. 3 projected, Eq. 4).
 
 ``B`` depends on the contact points: B(r) = B_0 + sum_k r_k B_k with r = (front, rear) x (x, z).
 A model with fixed contact points (the paper) has B_k = 0.

@@ -1,6 +1,6 @@
 """Dictionaries of observables Pi(x): names, units and a pure function each.
 
-The paper's dictionary is ``[1, p, theta, v, omega, vec(R omega), ..., vec(R omega^p)]``. A planar
+The paper's dictionary (Eq. 9) is ``[1, p, theta, v, omega, vec(R omega), ..., vec(R omega^p)]``. A planar
 rotation holds its cosine twice and its sine with both signs, so the literal dictionary repeats
 columns and its Gram matrix has no inverse; ``paper`` drops the repeats (N = 7 + 2p).
 """
@@ -49,7 +49,7 @@ class Dictionary(NamedTuple):
 
 
 def paper(order: int = 4, *, literal: bool = False, constant_rotation: bool = False) -> Dictionary:
-    """The paper's physics-informed dictionary.
+    """The paper's physics-informed dictionary (Eq. 9).
 
     Args:
       order: highest power p of omega.

@@ -11,7 +11,7 @@ from kjax.types import RobotParams
 def stance_torque(
     robot: RobotParams, trig: LegTrig, force: Float[Array, "4 2"]
 ) -> Float[Array, "4 2"]:
-    """Thigh and calf torque (4, 2) [N m] for ground reaction forces: tau = -J^T f.
+    """Thigh and calf torque (4, 2) [N m] for ground reaction forces: tau = -J^T f (Eq. 18).
 
     The paper writes tau = J^T f with f the force of the foot on the ground; ours is the reaction,
     the force on the robot, hence the sign.

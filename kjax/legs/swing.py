@@ -316,7 +316,7 @@ def swing_torque(
     position: Float[Array, "4 n"],
     velocity: Float[Array, "4 n"],
 ) -> Float[Array, "4 n"]:
-    """Torque (4, n) of the joint PD on the last n joints (the paper's swing controller) [N m]."""
+    """Torque (4, n) of the joint PD on the last n joints (Eq. 17) [N m]."""
     n = position.shape[1]
     return params.kp[-n:] * (position - joint_pos[:, -n:]) + params.kd[-n:] * (
         velocity - joint_vel[:, -n:]

@@ -1,11 +1,13 @@
 """Condensed LMPC: the states eliminated, a QP in the forces alone.
 
-    minimise over U   sum_{i=1..k} |x_i - x_i^d|^2_Q + |u_{i-1} - u_ref|^2_R
-    subject to        z_{i+1} = A z_i + B u_i,   x_i = C_x z_i,   u_min <= u_i <= u_max
+    minimise over U   sum_{i=1..k} |x_i - x_i^d|^2_Q + |u_{i-1} - u_ref|^2_R         (Eq. 10)
+    subject to        z_{i+1} = A z_i + B u_i                                        (Eq. 11)
+                      x_i = C_x z_i,   u_min <= u_i <= u_max                         (Eq. 12)
 
-Stacking the predictions as X = A_qp z_0 + B_qp U gives 1/2 U^T H U + q^T U with
-H = 2 (B_qp^T Q B_qp + R) and q = F z_0 - G X^d - 2 R U_ref. The paper writes A_qp x_0; the matrix
-has to act on the lifted state z_0 = Pi(x_0).
+Stacking the predictions as X = A_qp z_0 + B_qp U (Eq. 13) in the cost (Eq. 14) gives
+1/2 U^T H U + q^T U (Eq. 15) with H = 2 (B_qp^T Q B_qp + R) and q = F z_0 - G X^d - 2 R U_ref. The
+paper writes A_qp x_0; the matrix has to act on the lifted state z_0 = Pi(x_0). The constraints on
+the inputs (Eq. 16) are a box, and rows of ``mpc.limits``.
 """
 
 from typing import NamedTuple

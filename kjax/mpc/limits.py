@@ -1,4 +1,4 @@
-"""Rows on the forces of one step: friction pyramid, and joint torque limits through J^T."""
+"""Rows on the forces of one step (Eq. 16): friction pyramid, joint torque limits through J^T."""
 
 from typing import NamedTuple
 

@@ -167,10 +167,10 @@ def _derivative(settings: RowSettings, primals: Any, tangents: Any) -> tuple[Any
 def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
     least = 20.0 * float(jnp.finfo(qp.q.dtype).eps)
     settings = settings._replace(tolerance=max(settings.tolerance, least))
-    data, finite, consistent = _checked(qp.stacked())
+    data, good, finite, consistent = _checked(qp.stacked())
     # step 1; the active set wants curvature everywhere, and needs no other units then
     by_curvature = settings.method in ("auto", "active_set")
-    posed = pose(data, finite & consistent, equilibrate=not by_curvature)
+    posed = pose(data, good, equilibrate=not by_curvature)
     evidence = None
     if settings.method == "interior_point":  # steps 2 and 3
         found = by_interior_point(settings, posed)
@@ -224,21 +224,21 @@ def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
     )
 
 
-def _checked(data: RowData) -> tuple[RowData, Array, Array]:
-    """Symmetric data, harmless where faulty; whether all is finite, and the bounds consistent."""
+def _checked(data: RowData) -> tuple[RowData, Array, Array, Array]:
+    """Symmetric data, harmless where faulty; whether it is good, finite, of consistent bounds."""
     H, q, C, low, high = data
     finite = jnp.stack([jnp.isfinite(a).all() for a in (H, q, C)]).all()
     finite = finite & ~(jnp.isnan(low) | jnp.isnan(high)).any()
     consistent = ((low <= high) & (low < jnp.inf) & (high > -jnp.inf)).all()
-    sound = finite & consistent
+    good = finite & consistent
     safe = RowData(
-        jnp.where(sound, 0.5 * (H + H.T), jnp.eye(q.shape[0], dtype=H.dtype)),
-        jnp.where(sound, q, 0.0),
-        jnp.where(sound, C, 0.0),
-        jnp.where(sound, low, -jnp.inf),
-        jnp.where(sound, high, jnp.inf),
+        jnp.where(good, 0.5 * (H + H.T), jnp.eye(q.shape[0], dtype=H.dtype)),
+        jnp.where(good, q, 0.0),
+        jnp.where(good, C, 0.0),
+        jnp.where(good, low, -jnp.inf),
+        jnp.where(good, high, jnp.inf),
     )
-    return safe, finite, consistent
+    return safe, good, finite, consistent
 
 
 def _inside(x: Array, qp: _Qp, consistent: Array) -> Array:
