@@ -131,7 +131,9 @@ def test_a_home_that_cannot_be_written_to_is_a_line_too(monkeypatch, tmp_path, c
 def test_the_core_imports_neither_mujoco_nor_matplotlib():
     code = (
         "import sys, kjax, kjax.robots.go1;"
-        "print([m for m in ('mujoco', 'matplotlib', 'optax', 'tqdm') if m in sys.modules])"
+        "extras = 'mujoco', 'matplotlib', 'optax', 'tqdm', 'xarray', 'tomli_w', 'cma';"
+        "own = 'kjax.bench', 'kjax.studies', 'kjax.runs', 'kjax.sim', 'kjax.viz';"
+        "print([m for m in (*extras, *own) if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
