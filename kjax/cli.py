@@ -113,12 +113,24 @@ def parse_study(
     for name in args.only:
         if name not in names:
             fail(f"--only: got '{name}', wanted some of {', '.join(names)}")
-    for name in whole:
-        if getattr(args, name) < 1:
-            fail(f"--{name}: got {getattr(args, name)}, wanted at least 1")
+    require(args, *whole, least=1)
     args.out = args.out or Path("results") / default_out
     args.bases = ("planar", "free") if args.base == "both" else (args.base,)
     return args
+
+
+def require(
+    args: argparse.Namespace, *names: str, least: float | None = None, above: float | None = None
+) -> None:
+    """End the program where an option is out of range; one that was not given passes."""
+    for name in names:
+        value, option = getattr(args, name), f"--{name.replace('_', '-')}"
+        if value is None:
+            continue
+        if least is not None and not value >= least:
+            fail(f"{option}: got {value}, wanted at least {least:g}")
+        if above is not None and not value > above:
+            fail(f"{option}: got {value}, wanted more than {above:g}")
 
 
 def build_parser(cls: type, description: str) -> argparse.ArgumentParser:

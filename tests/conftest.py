@@ -52,7 +52,7 @@ DT = 1e-3  # s, step of the shared snapshots
 
 # The files that take longest, first: a worker that gets one last would leave the other idle.
 LONGEST = (
-    "test_mjx", "test_notebooks", "test_tune", "test_whole_body", "test_free_base",
+    "test_mjx", "test_notebooks", "test_tune", "test_study", "test_whole_body", "test_free_base",
     "test_sensitivity", "test_runner", "test_loop", "test_excitation", "test_mujoco",
     "test_mujoco_batch", "test_closed_loop",
     "test_reproduce", "test_solvers", "test_rows",

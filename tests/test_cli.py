@@ -2,13 +2,14 @@ import json
 import pwd
 import subprocess
 import sys
+from argparse import Namespace
 
 import jax
 import numpy as np
 import pytest
 
 from kjax import cli
-from kjax.config import RunConfig
+from kjax.config import ConfigError, RunConfig
 
 
 def parse(*words):
@@ -131,7 +132,9 @@ def test_a_home_that_cannot_be_written_to_is_a_line_too(monkeypatch, tmp_path, c
 def test_the_core_imports_neither_mujoco_nor_matplotlib():
     code = (
         "import sys, kjax, kjax.robots.go1;"
-        "print([m for m in ('mujoco', 'matplotlib', 'optax', 'tqdm') if m in sys.modules])"
+        "extras = 'mujoco', 'matplotlib', 'optax', 'tqdm', 'xarray', 'tomli_w', 'cma';"
+        "own = 'kjax.bench', 'kjax.studies', 'kjax.runs', 'kjax.sim', 'kjax.viz';"
+        "print([m for m in (*extras, *own) if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
@@ -153,3 +156,39 @@ def test_the_core_imports_neither_mujoco_nor_matplotlib():
 )
 def test_what_cannot_walk_is_one_line_before_anything_is_compiled(capsys, words, text):
     assert text in refusal(capsys, *words)
+
+
+def test_an_option_out_of_range_is_one_line_and_one_that_was_not_given_passes(capsys):
+    args = Namespace(seeds=0, held_out=0.0, threads=None, weight=float("nan"), updates=3)
+    cli.require(args, "threads", "updates", least=1)
+    cli.require(args, "threads", "updates", above=0)
+    for name, limit, said in (
+        ("seeds", {"least": 1}, "error: --seeds: got 0, wanted at least 1\n"),
+        ("held_out", {"above": 0}, "error: --held-out: got 0.0, wanted more than 0\n"),
+        ("weight", {"above": 0}, "error: --weight: got nan, wanted more than 0\n"),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            cli.require(args, name, **limit)
+        assert caught.value.code == 2
+        assert capsys.readouterr().err == said
+
+
+def test_a_script_ends_with_the_exit_code_of_its_main_and_without_a_traceback(capsys):
+    def ends(main):
+        with pytest.raises(SystemExit) as caught:
+            cli.run(main, ["--quick"])
+        return caught.value.code
+
+    def throws(error):
+        def main(argv):
+            raise error
+
+        return main
+
+    assert ends(lambda argv: 7 if argv == ["--quick"] else 1) == 7
+    assert ends(throws(KeyboardInterrupt())) == 130
+    assert ends(throws(OSError(28, "No space left on device", "out/a.json"))) == 2
+    assert ends(throws(ConfigError("lmpc: no"))) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1:] == ["error: out/a.json: No space left on device", "error: lmpc: no"]
+    assert "interrupted" in lines[0]

@@ -123,6 +123,15 @@ def test_the_commands_name_files_and_keys_that_exist(page, repository):
         assert f"\n{target}: " in targets, target
 
 
+def test_there_are_commands_pictures_and_targets_to_look_for(repository):
+    """The checks beside this one pass on a page that has none of them."""
+    text = "\n".join(one for page in PAGES for one in blocks(repository, page, "bash"))
+    assert len(re.findall(r"experiments/\w+\.py", text)) > 20
+    assert "make setup" in text
+    links = re.findall(r"\]\(([^)#:]+)\)", (repository / "README.md").read_text(encoding="utf-8"))
+    assert len(links) > 5
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_nothing_is_left_to_be_filled_in(page, repository):
     assert not re.search(r"@@|TODO|TBD", (repository / page).read_text(encoding="utf-8"))

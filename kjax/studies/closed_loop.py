@@ -66,8 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--restart", action="store_true",
                         help="with --seeds: drop the seeds that the folder holds")  # fmt: skip
     config, args = cli.parse(RunConfig, parser, argv)
-    if args.seeds is not None and args.seeds < 1:
-        cli.fail(f"--seeds: got {args.seeds}, wanted at least 1")
+    cli.require(args, "seeds", least=1)
     if args.view and args.seeds is not None:
         cli.fail("--view: shows a single run, leave --seeds out")
     if args.restart and args.seeds is None:

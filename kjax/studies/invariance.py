@@ -142,9 +142,7 @@ def _parse(argv: Sequence[str] | None) -> Namespace:
     parser.add_argument("--quick", action="store_true",
                         help="2 cells, 2 seeds, 0.8 s: to check the script")  # fmt: skip
     args = parser.parse_args(argv)
-    for name in ("seeds", "threads"):
-        if getattr(args, name) is not None and getattr(args, name) < 1:
-            cli.fail(f"--{name}: got {getattr(args, name)}, wanted at least 1")
+    cli.require(args, "seeds", "threads", least=1)
     for name in ("residual", "learned"):
         file = getattr(args, name)
         if file is not None and not file.is_file():

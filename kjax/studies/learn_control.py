@@ -108,9 +108,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--weight", type=float, default=0.1, help="of the closed loops' cost")
     parser.add_argument("--walks", type=int, default=16, help="seeds in MuJoCo")
     args = parser.parse_args(argv)
-    for name in ("updates", "rate", "scenarios", "seconds", "weight", "walks"):
-        if not getattr(args, name) > 0:
-            cli.fail(f"--{name}: got {getattr(args, name)}, wanted more than 0")
+    names = ("updates", "rate", "scenarios", "seconds", "weight", "walks")
+    cli.require(args, *names, above=0)
     return args
 
 

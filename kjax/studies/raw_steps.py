@@ -131,9 +131,7 @@ def _parse(argv: Sequence[str] | None) -> Namespace:
     parser.add_argument("--quick", action="store_true",
                         help="2 seeds, one step from each speed: to check")  # fmt: skip
     args = parser.parse_args(argv)
-    for name in ("seeds", "threads"):
-        if getattr(args, name) is not None and getattr(args, name) < 1:
-            cli.fail(f"--{name}: got {getattr(args, name)}, wanted at least 1")
+    cli.require(args, "seeds", "threads", least=1)
     if args.quick:
         args.seeds = min(args.seeds, 2)
     return args

@@ -81,9 +81,7 @@ def _parse(argv: Sequence[str] | None) -> tuple[SweepConfig, Namespace]:
     parser.add_argument("--processes", type=int, help="their number")
     parser.add_argument("--process", type=int, help="number of this one, from 0 on")
     args = parser.parse_args(argv)
-    for name in ("seeds", "chunk", "threads"):
-        if getattr(args, name) is not None and getattr(args, name) < 1:
-            cli.fail(f"--{name}: got {getattr(args, name)}, wanted at least 1")
+    cli.require(args, "seeds", "chunk", "threads", least=1)
     given = {name: getattr(args, name) for name in ("engine", "torques", "seeds", "chunk")}
     try:
         sweep = load_config(

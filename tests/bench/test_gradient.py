@@ -65,13 +65,26 @@ def test_what_is_not_finite_and_what_rounding_drowns_is_counted(costs):
     assert entry["drowned"] == 2  # a parameter that does nothing, in both scenarios
 
 
-def test_the_price_is_a_batch_s_time_and_memory(costs):
+def test_the_price_is_a_batch_s_time_with_and_without_its_gradient(costs, monkeypatch):
+    results = {}
+
+    def interleaved(calls, rounds):
+        assert rounds == 3
+        results.update({name: call(0) for name, call in calls.items()})
+        return {"value": np.array([1.0, 2.0, 4.0]), "both": np.array([2.0, 6.0, 10.0])}
+
+    monkeypatch.setattr(gradient, "interleaved", interleaved)
     costs(smooth)
     found = gradient.priced(None, SPACE, 4, 3)
-    assert found["value_s"] > 0.0
-    assert found["value_and_grad_s"] > 0.0
-    assert found["grad_over_value"] > 0.0
-    assert min(found["value_MB"], found["value_and_grad_MB"]) >= 0.0
+    # What is timed is the mean over the batch, and its gradient: 4 by b in every scenario.
+    value, slopes = results["both"]
+    assert value == pytest.approx(float(results["value"]))
+    assert value == pytest.approx(2.5 * np.sin([0.5, -1.0]).sum() + 4.0)
+    assert slopes["b"] == pytest.approx(4.0)
+    assert (found["value_s"], found["value_and_grad_s"]) == (2.0, 6.0)
+    assert found["grad_over_value"] == 2.5  # of the rounds' ratios 2, 3 and 2.5
+    program = SimpleNamespace(memory_analysis=lambda: SimpleNamespace(temp_size_in_bytes=3e6))
+    assert gradient._temporary_memory(program) == 3.0
 
 
 @pytest.mark.slow

@@ -49,6 +49,16 @@ def test_the_verbs_are_those_of_the_help(call, capsys):
         assert f"\n{verb}: " in text
 
 
+@pytest.mark.parametrize("verb", main.BENCHMARKS)
+def test_each_verb_has_help_of_its_own(call, capsys, verb):
+    assert call(entry, verb, "--help") == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: benchmark.py {verb}")
+    option = {"controller": "--no-startup", "edmd": "--peers PYTHON", "qp": "--problems DIR",
+              "gradient": "--through-flight"}.get(verb, "--quick")  # fmt: skip
+    assert option in text
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

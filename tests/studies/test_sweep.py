@@ -1,12 +1,14 @@
 """The sweep's script: what it says, and what it draws from a finished sweep."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from kjax.config import SweepConfig, load_config, to_dict
+from kjax.runs.sweeps import runner
 from kjax.studies import sweep
 
 
@@ -74,3 +76,90 @@ def test_a_sweep_is_not_drawn_as_another_one(drawn, capsys, tmp_path, old, new):
     assert text.count("\n") == 1
     assert "holds another sweep" in text
     assert not (tmp_path / "figure.png").exists()
+
+
+# The script, with a stand-in for the engine.
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    """Stand in for the engine: the faster of two speeds makes seed 0 fall.
+
+    ``chunks`` are the seeds of those that were run; Ctrl-C comes before chunk ``stop_at``.
+    """
+    log = SimpleNamespace(chunks=[], stop_at=None)
+
+    class Engine:
+        def run(self, configs, on_progress):
+            if len(log.chunks) == log.stop_at:
+                raise KeyboardInterrupt
+            log.chunks.append([config.seed for config in configs])
+            rows = [
+                {"fell": config.seed == 0 and config.command.v_x[0] > 0.2,
+                 "velocity_rmse_mps": config.command.v_x[0]}
+                for config in configs
+            ]  # fmt: skip
+            return SimpleNamespace(interrupted=False, metrics=lambda: iter(rows))
+
+    monkeypatch.setattr(runner, "build_engine", lambda sweep, config, threads: Engine())
+    return log
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "walk.toml").write_text("")
+    path = tmp_path / "sweep.toml"
+    path.write_text(SWEEP)
+    return path
+
+
+def test_a_sweep_leaves_its_cases_a_summary_and_a_figure_and_goes_on(
+    engine, call, capsys, file, tmp_path
+):
+    words = (file, "--chunk", 1, "--seeds", 3, "--out", tmp_path / "out")
+    engine.stop_at = 2
+    assert call(sweep.main, *words) == 130
+    assert "finished chunks are kept" in capsys.readouterr().out
+    engine.stop_at = None
+    assert call(sweep.main, *words) == 0
+    assert len(engine.chunks) == 6  # two speeds by three seeds, none of them twice
+    names = {path.name for path in (tmp_path / "out").iterdir() if not path.name.startswith(".")}
+    assert names == {"sweep.nc", "summary.json", "figure.png", "cache"}
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert found["success"]["value"] == pytest.approx([1.0, 2 / 3], abs=1e-5)
+    assert found["speed"] == [0.1, 0.3]
+    with xr.open_dataset(tmp_path / "out" / "sweep.nc") as data:
+        np.testing.assert_array_equal(data["fell"].sel(speed=0.3), [1, 0, 0])
+        np.testing.assert_array_equal(data["velocity_rmse_mps"].sel(speed=0.1), 0.1)
+    out = capsys.readouterr().out
+    assert "6 episodes, 5 succeeded (stayed up), 1 fell; median RMSE of the others 0.1000" in out
+    # Finished, it only draws; asked to draw, it reads no config of a robot.
+    assert call(sweep.main, *words) == 0
+    (tmp_path / "walk.toml").unlink()
+    assert call(sweep.main, *words, "--draw") == 0
+    assert len(engine.chunks) == 6
+
+
+def test_all_of_it_again_when_asked(engine, call, file, tmp_path):
+    words = (file, "--out", tmp_path / "out")
+    assert call(sweep.main, *words) == 0
+    count = len(engine.chunks)
+    assert call(sweep.main, *words, "--restart") == 0
+    assert len(engine.chunks) == 2 * count
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--seeds", 0], "--seeds: got 0, wanted at least 1"),
+        (["--engine", "bullet"], "engine: got 'bullet'"),
+        (["--processes", 2], "--coordinator, --processes and --process: wanted all three"),
+        (["--draw"], "--draw: "),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(engine, call, capsys, file, tmp_path, words, said):
+    assert call(sweep.main, file, *words, "--out", tmp_path / "out") == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert said in err
+    assert engine.chunks == []

@@ -49,7 +49,10 @@ def _drive(config: RunConfig, planner: planning.Planner, seconds: float) -> list
 
 
 def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The box QPs of a closed loop: prepared Hessians, modes, q and bounds of every tick."""
+    """The box QPs of a closed loop: prepared Hessians, modes, q and bounds of every tick.
+
+    Of QPs with rows, which are seldom active, it is the box that is solved first.
+    """
     config = load_config(RunConfig, shipped_config(f"{name}.toml"), changes or {})
     plan_of = planning.build_planner(controller_spec(config))
 
@@ -58,12 +61,19 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
 
         def solve(prepared: Any, q: Any, lower: Any, upper: Any, *args: Any, **options: Any) -> Any:
             seen.update(q=q, lower=lower, upper=upper)
-            return real(prepared, q, lower, upper, *args, **options)
+            return box(prepared, q, lower, upper, *args, **options)
 
-        real = qp.solve
-        with mock.patch.object(qp, "solve", solve):
+        def solve_with_rows(prepared: Any, q: Any, *args: Any, **options: Any) -> Any:
+            seen.update(q=q, lower=args[3], upper=args[4])  # behind the rows and their bounds
+            return rows(prepared, q, *args, **options)
+
+        box, rows = qp.solve, qp.solve_rows_from_box
+        with (
+            mock.patch.object(qp, "solve", solve),
+            mock.patch.object(qp, "solve_rows_from_box", solve_with_rows),
+        ):
             plan = plan_of(tables, task)
-        recorded: Any = (task.mode, seen["q"], seen["lower"], seen["upper"])
+        recorded: Any = (plan.memory.problem, seen["q"], seen["lower"], seen["upper"])
         return plan._replace(memory=recorded)
 
     mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))

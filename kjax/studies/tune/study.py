@@ -204,10 +204,9 @@ def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
     parser.add_argument("--seeds", type=int, default=16, help="episodes in MuJoCo at the end")
     config, args = cli.parse(RunConfig, parser, argv)
     args.speeds = min(config.command.v_x), max(config.command.v_x)
-    for name in ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
-                 "minutes", "worsen", "memory", "seeds"):  # fmt: skip
-        if not getattr(args, name) > 0:
-            cli.fail(f"--{name.replace('_', '-')}: got {getattr(args, name)}, wanted more than 0")
+    names = ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
+             "minutes", "worsen", "memory", "seeds")  # fmt: skip
+    cli.require(args, *names, above=0)
     if config.sim.base != "planar":
         cli.fail(f"sim.base: got '{config.sim.base}', wanted 'planar': the plant is planar")
     if args.keys is None:
