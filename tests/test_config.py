@@ -289,9 +289,7 @@ def test_what_a_gait_is_left_through_is_compiled_in_however_far_it_goes():
 def test_names_of_earlier_versions_say_what_has_become_of_them():
     with pytest.raises(ImportError, match=r"BoundConfig has gone: use GaitConfig, .*LIBRARY"):
         from kjax.config import BoundConfig  # noqa: F401
-    with pytest.raises(
-        ImportError, match=r"kjax\.gait\.trot has gone: use kjax\.config\.gaits\.LIBRARY"
-    ):
+    with pytest.raises(ImportError, match=r"kjax\.gait\.trot has gone: .*gaits\.LIBRARY"):
         from kjax.gait import trot  # noqa: F401
     with pytest.raises(ImportError, match="cannot import name 'gallop'"):
         from kjax.gait import gallop  # noqa: F401

@@ -1,4 +1,4 @@
-"""Planar single rigid body with forces at the front and the rear feet (Eq. 1 and Eq. 2 of the paper).
+"""Planar single rigid body with forces at the front and the rear feet (Eq. 1, Eq. 2).
 
     p'' = R(theta) (alpha_f F_f + alpha_r F_r) / m - g
     theta'' = (r_f x alpha_f F_f + r_r x alpha_r F_r) / I

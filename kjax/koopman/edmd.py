@@ -1,8 +1,8 @@
 """EDMD: the least-squares operator K = [A, B] from snapshots (Eq. 5), solved robustly.
 
-The paper writes K = G_1 G_2^-1 (Eq. 6, Eq. 7, Eq. 8) with G_2 = mean(Pi [Pi; u]^T), which is not square; the regression
-wants the Gram matrix of the full regressor [Pi; u]. We do not form a Gram matrix at all, since it
-squares the condition number: ``regression`` works on the R of a QR factorisation, with the
+The paper writes K = G_1 G_2^-1 (Eq. 6, Eq. 7, Eq. 8) with G_2 = mean(Pi [Pi; u]^T), which is not
+square; the regression wants the Gram matrix of the full regressor [Pi; u]. We do not form a Gram
+matrix at all, since it squares the condition number: ``regression`` works on the R of a QR factorisation, with the
 columns scaled to unit norm, and an SVD of that small factor reveals the rank. The regression is
 on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small steps.
 """
@@ -110,9 +110,9 @@ def fit(
     ridge: float | Float[Array, ""] = 0.0,
     use: Bool[Array, "N"] | None = None,
 ) -> tuple[LinearModel, FitReport]:
-    """Linear model of one contact mode and a report; ``vmap`` it over modes, seeds, ranges, ridge.
+    """Linear model of one contact mode and a report (Eq. 5); ``vmap`` it over modes, seeds, ranges.
 
-        K = argmin sum_i |Pi(y_i) - Pi(x_i) - K [Pi(x_i); u_i]|^2,   A = I + K_Pi,   B = K_u    (Eq. 5)
+        K = argmin sum_i |Pi(y_i) - Pi(x_i) - K [Pi(x_i); u_i]|^2,   A = I + K_Pi,   B = K_u
 
     Args:
       dictionary: observables.

@@ -1,7 +1,7 @@
 """Dictionaries of observables Pi(x): names, units and a pure function each.
 
-The paper's dictionary (Eq. 9) is ``[1, p, theta, v, omega, vec(R omega), ..., vec(R omega^p)]``. A planar
-rotation holds its cosine twice and its sine with both signs, so the literal dictionary repeats
+The paper's dictionary is ``[1, p, theta, v, omega, vec(R omega), ..., vec(R omega^p)]`` (Eq. 9). A
+planar rotation holds its cosine twice and its sine with both signs, so the literal dictionary repeats
 columns and its Gram matrix has no inverse; ``paper`` drops the repeats (N = 7 + 2p).
 """
 
