@@ -2,9 +2,10 @@
 
 The paper writes K = G_1 G_2^-1 (Eq. 6, Eq. 7, Eq. 8) with G_2 = mean(Pi [Pi; u]^T), which is not
 square; the regression wants the Gram matrix of the full regressor [Pi; u]. We do not form a Gram
-matrix at all, since it squares the condition number: ``regression`` works on the R of a QR factorisation, with the
-columns scaled to unit norm, and an SVD of that small factor reveals the rank. The regression is
-on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small steps.
+matrix at all, since it squares the condition number: ``regression`` works on the R of a QR
+factorisation, with the columns scaled to unit norm, and an SVD of that small factor reveals the
+rank. The regression is on the increment Pi(y) - Pi(x), so that float32 keeps its digits at small
+steps.
 """
 
 from collections.abc import Sequence

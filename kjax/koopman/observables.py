@@ -1,8 +1,8 @@
 """Dictionaries of observables Pi(x): names, units and a pure function each.
 
 The paper's dictionary is ``[1, p, theta, v, omega, vec(R omega), ..., vec(R omega^p)]`` (Eq. 9). A
-planar rotation holds its cosine twice and its sine with both signs, so the literal dictionary repeats
-columns and its Gram matrix has no inverse; ``paper`` drops the repeats (N = 7 + 2p).
+planar rotation holds its cosine twice and its sine with both signs, so the literal dictionary
+repeats columns and its Gram matrix has no inverse; ``paper`` drops the repeats (N = 7 + 2p).
 """
 
 from collections.abc import Callable, Sequence
