@@ -214,14 +214,54 @@ def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _
     )
 
 
+class _Step(NamedTuple):
+    """Outcome of the ratio test.
+
+    Attributes:
+      is_chosen: (M,) 1 at the row to add.
+      z: (n,) direction P a of x.
+      r: (M,) direction U a of the multipliers, downwards.
+      curvature: a^T P a.
+      depends: whether the row's normal depends on the active ones: x does not move.
+      t: length of the step; 0 where nothing is done.
+      is_dropped: (M,) 1 at the row that is in the way.
+      adds: whether the step ends at the chosen row, not at the one in the way.
+      stuck: whether it ends nowhere.
+      redundant: whether the row then holds already.
+    """
+
+    is_chosen: Array
+    z: Array
+    r: Array
+    curvature: Array
+    depends: Array
+    t: Array
+    is_dropped: Array
+    adds: Array
+    stuck: Array
+    redundant: Array
+
+
 def _advance(
     settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _Sizes
 ) -> ActiveSet:
     """Steps 3 and 4: add the chosen row, or drop the one that is in its way; then step 2."""
+    step = _ratio_test(state, problem, sizes)
+    next_state, drop = _exchange(state, problem, step)
+    chosen = _choose(settings, next_state, problem, sizes)
+    # A row that could not be added yet is tried again.
+    again = drop & (next_state.iterations < settings.max_iterations)
+    return chosen._replace(
+        chosen=jnp.where(drop, state.chosen, chosen.chosen),
+        sign=jnp.where(drop, state.sign, chosen.sign),
+        pending=jnp.where(drop, again, chosen.pending),
+    )
+
+
+def _ratio_test(state: ActiveSet, problem: RowProblem, sizes: _Sizes) -> _Step:
+    """Step 3."""
     n, dtype = problem.q.shape[0], problem.q.dtype
     eps = float(jnp.finfo(dtype).eps)
-    pending = state.pending
-    U = state.stack[n:]
     index = jnp.arange(state.y.shape[0], dtype=jnp.int32)
     is_chosen = (index == state.chosen).astype(dtype)
     normal = state.sign * problem.adjoint(is_chosen)
@@ -245,13 +285,26 @@ def _advance(
     # An equation that follows from others and holds already is in no one's way.
     stuck = ~jnp.isfinite(step)
     size = jnp.abs(wanted) + jnp.max(jnp.abs(state.x))
-    redundant = stuck & (violation <= 1e3 * eps * n * size)
-    adds = t_add <= t_drop
-    t = jnp.where(pending & ~stuck, step, 0.0)
+    return _Step(
+        is_chosen=is_chosen,
+        z=z,
+        r=r,
+        curvature=curvature,
+        depends=depends,
+        redundant=stuck & (violation <= 1e3 * eps * n * size),
+        adds=t_add <= t_drop,
+        t=jnp.where(state.pending & ~stuck, step, 0.0),
+        is_dropped=(index == dropped).astype(dtype),
+        stuck=stuck,
+    )
 
+
+def _exchange(state: ActiveSet, problem: RowProblem, step: _Step) -> tuple[ActiveSet, Array]:
+    """Step 4: the state after the step; and whether a row was dropped."""
+    pending, U = state.pending, state.stack[problem.q.shape[0] :]
+    is_chosen, z, r, curvature, depends, t, is_dropped, adds, stuck, redundant = step
     x = state.x + jnp.where(depends, 0.0, t) * z
     y = jnp.maximum(state.y - t * r, jnp.where(problem.equal, -jnp.inf, 0.0)) + t * is_chosen
-    is_dropped = (index == dropped).astype(dtype)
     u = is_dropped @ U
     Hu = problem.H @ u
     uHu = u @ Hu
@@ -275,14 +328,7 @@ def _advance(
         infeasible=state.infeasible | fails,
         iterations=state.iterations + pending,
     )
-    chosen = _choose(settings, next_state, problem, sizes)
-    # A row that could not be added yet is tried again.
-    again = drop & (next_state.iterations < settings.max_iterations)
-    return chosen._replace(
-        chosen=jnp.where(drop, state.chosen, chosen.chosen),
-        sign=jnp.where(drop, state.sign, chosen.sign),
-        pending=jnp.where(drop, again, chosen.pending),
-    )
+    return next_state, drop
 
 
 def _polish(problem: RowProblem, state: ActiveSet) -> tuple[Float[Array, "n"], Float[Array, "M"]]:

@@ -18,10 +18,10 @@ from kjax.qp.batching import in_chunks, where_needed
 from kjax.qp.first_order import FIRST_ORDER, descend
 from kjax.qp.problem import (
     Prepared,
+    ScaledBox,
     Solution,
     Status,
     Warm,
-    box_error,
     no_tangent,
     start,
     swept,
@@ -45,6 +45,8 @@ def solve(
     max_iterations: int = 2000,
 ) -> Solution:
     """Minimiser of 1/2 x^T H x + q^T x on lower <= x <= upper.
+
+    Nine arguments: the problem as in any QP library, and options by keyword.
 
     Args:
       prepared: from ``prepare(H)``.
@@ -189,10 +191,11 @@ def _solve(
     d = prepared.scale
     q_hat = jnp.where(good, q * d, 0.0)
     low, high = jnp.where(good, lower / d, -jnp.inf), jnp.where(good, upper / d, jnp.inf)
+    box = ScaledBox(prepared.H, q_hat, low, high)
     tolerance = max(settings.tolerance, 20.0 * float(jnp.finfo(q.dtype).eps))
     guess = jnp.where(jnp.isfinite(warm.x), warm.x, 0.0)
     method: Callable[..., _Found] = _by_pivoting if settings.method == "tableau" else _by_descent
-    found = method(settings, prepared, q_hat, low, high, warm._replace(x=guess / d), tolerance)
+    found = method(settings, prepared, box, warm._replace(x=guess / d), tolerance)
 
     gradient = prepared.H @ found.x + q_hat
     size = jnp.maximum(jnp.max(jnp.abs(q_hat)), jnp.max(jnp.abs(found.x)))
@@ -229,32 +232,21 @@ def _solve(
 
 
 def _by_descent(
-    settings: _Settings,
-    prepared: Prepared,
-    q: Array,
-    lower: Array,
-    upper: Array,
-    warm: Warm,
-    tolerance: float,
+    settings: _Settings, prepared: Prepared, box: ScaledBox, warm: Warm, tolerance: float
 ) -> _Found:
     x, residual, count = descend(
-        FIRST_ORDER[settings.method], prepared, q, lower, upper, warm.x,
+        FIRST_ORDER[settings.method], prepared, box, warm.x,
         tolerance=tolerance, max_iterations=settings.max_iterations,
     )  # fmt: skip
     never = jnp.zeros((), bool)
     return _Found(x, residual, count, prepared.table, prepared.side, current=never)
 
 
-class _Box(NamedTuple):
-    """The scaled problem."""
+class _Limits(NamedTuple):
+    """Residual that is good enough, and how many exchanges may be made."""
 
-    H: Array
-    q: Array
-    lower: Array
-    upper: Array
-
-    def residual(self, x: Array) -> Array:
-        return box_error(self.H, self.q, self.lower, self.upper, x)
+    tolerance: float
+    exchanges: int
 
 
 class _Tried(NamedTuple):
@@ -267,15 +259,10 @@ class _Tried(NamedTuple):
 
 
 def _by_pivoting(
-    settings: _Settings,
-    prepared: Prepared,
-    q: Array,
-    lower: Array,
-    upper: Array,
-    warm: Warm,
-    tolerance: float,
+    settings: _Settings, prepared: Prepared, box: ScaledBox, warm: Warm, tolerance: float
 ) -> _Found:
     """Pivot from the warm start; where rounding has spoilt its tableau, once more from the cold."""
+    _, q, lower, upper = box
     # The point's size is not known yet; bounds that keep it from 0 are a part of it, and a box
     # around it limits it.
     least = jnp.max(jnp.maximum(jnp.maximum(lower, -upper), 0.0))
@@ -285,15 +272,16 @@ def _by_pivoting(
     # Far below the tolerance, which the condition multiplies on its way to x.
     eps = float(jnp.finfo(q.dtype).eps)
     relative = max(10.0 * eps, 1e-3 * tolerance)
-    limit = min(settings.max_iterations, 10 * q.shape[0])
+    limits = _Limits(tolerance, min(settings.max_iterations, 10 * q.shape[0]))
     threshold = relative * jnp.minimum(size, widest), relative * size
 
-    box = _Box(prepared.H, q, lower, upper)
-    first = pivot(warm.table, warm.side, q, lower, upper, threshold=threshold, limit=limit)
+    first = pivot(
+        warm.table, warm.side, q, lower, upper, threshold=threshold, limit=limits.exchanges
+    )
     attempt = _try(box, first)
     tried = where_needed(
         ~(attempt.residual <= tolerance),
-        partial(_refactorise, tolerance, limit),
+        partial(_refactorise, limits),
         attempt,
         box,
         first,
@@ -311,12 +299,12 @@ def _by_pivoting(
     )
 
 
-def _try(box: _Box, done: Pivoted) -> _Tried:
+def _try(box: ScaledBox, done: Pivoted) -> _Tried:
     x = done.point(box.lower, box.upper)
     return _Tried(x, box.residual(x), done.exchanges, corrupted=jnp.zeros((), bool))
 
 
-def _polish(box: _Box, tried: _Tried, done: Pivoted) -> _Tried:
+def _polish(box: ScaledBox, tried: _Tried, done: Pivoted) -> _Tried:
     """A Newton step on the free variables, the tableau an inverse near enough."""
     free = done.side == 0
     move = done.table @ jnp.where(free, -(box.H @ tried.x + box.q), 0.0)
@@ -328,10 +316,9 @@ def _polish(box: _Box, tried: _Tried, done: Pivoted) -> _Tried:
 
 
 def _refactorise(
-    tolerance: float,
-    limit: int,
+    limits: _Limits,
     tried: _Tried,
-    box: _Box,
+    box: ScaledBox,
     first: Pivoted,
     table: Array,
     side: Array,
@@ -342,17 +329,17 @@ def _refactorise(
     Then with thresholds of every variable's own, as q and the bounds may spread over many decades.
     """
     old = _polish(box, _polish(box, tried, first), first)
-    corrupted = ~(old.residual <= tolerance)
+    corrupted = ~(old.residual <= limits.tolerance)
     widest = jnp.maximum(jnp.abs(box.lower), jnp.abs(box.upper))
     eps = float(jnp.finfo(box.q.dtype).eps)
-    relative = max(10.0 * eps, 1e-3 * tolerance)
+    relative = max(10.0 * eps, 1e-3 * limits.tolerance)
     own = tuple(
         jnp.clip(relative * part, eps / relative * whole, whole)
         for part, whole in zip((widest, jnp.abs(box.q)), threshold, strict=True)
     )
     # Where nothing is corrupted no exchange is worth it, which saves a batch the waiting.
     own = jnp.where(corrupted, own[0], jnp.inf), jnp.where(corrupted, own[1], jnp.inf)
-    left = limit - first.exchanges
+    left = limits.exchanges - first.exchanges
     again = pivot(table, side, box.q, box.lower, box.upper, threshold=own, limit=left)
     new = _polish(box, _try(box, again), again)
     better = corrupted & ~(old.residual <= new.residual)

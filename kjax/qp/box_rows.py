@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 from kjax.qp.batching import where_needed
 from kjax.qp.box import Method, solve
 from kjax.qp.polish import solve_equations
-from kjax.qp.problem import Prepared, Status, Warm, no_tangent
+from kjax.qp.problem import Prepared, Solution, Status, Warm, no_tangent
 from kjax.qp.row_derivative import active_equations
 from kjax.qp.row_methods import RowMethod
-from kjax.qp.row_problem import rows_error
+from kjax.qp.row_problem import RowData, rows_error
 from kjax.qp.rows import solve_rows
 
 
@@ -51,6 +51,27 @@ class _Settings(NamedTuple):
     max_iterations: int
 
 
+class _Qp(NamedTuple):
+    """The caller's problem and start, or a change of it."""
+
+    prepared: Prepared
+    which: Array | None  # of a stack of Hessians
+    q: Array
+    C: Array
+    row_lower: Array
+    row_upper: Array
+    lower: Array
+    upper: Array
+    warm: Any
+
+    def stacked(self) -> RowData:
+        """The problem picked, in the caller's units but for H; bounds of rows and box in one."""
+        H = self.prepared.H if self.which is None else self.prepared.H[self.which]
+        low = jnp.concatenate([self.row_lower, self.lower])
+        high = jnp.concatenate([self.row_upper, self.upper])
+        return RowData(H, self.q, self.C, low, high)
+
+
 def solve_rows_from_box(
     prepared: Prepared,
     q: Float[Array, "n"],
@@ -68,6 +89,8 @@ def solve_rows_from_box(
     max_iterations: int = 2000,
 ) -> BoxRowSolution:
     """Minimiser of 1/2 x^T H x + q^T x within rows and box, the box tried first.
+
+    Thirteen arguments: those of ``solve_rows``, and options of both problems by keyword.
 
     Args:
       prepared: from ``prepare(H)``, H positive definite.
@@ -92,74 +115,56 @@ def solve_rows_from_box(
     settings = _Settings(box_method, row_method, tolerance, max_iterations)
     warm = jax.lax.stop_gradient(warm)
     return _differentiable(
-        settings, prepared, index, q, C, row_lower, row_upper, lower, upper, warm
+        settings, _Qp(prepared, index, q, C, row_lower, row_upper, lower, upper, warm)
     )
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _differentiable(settings: _Settings, *data: Any) -> BoxRowSolution:
-    prepared, index, q, _, _, _, lower, upper, warm = data
-    box = _solve_box(settings, prepared, index, q, lower, upper, warm)
-    return _with_rows(settings, box, *data)[0]
+def _differentiable(settings: _Settings, qp: _Qp) -> BoxRowSolution:
+    return _with_rows(settings, _solve_box(settings, qp), qp)[0]
 
 
-def _solve_box(
-    settings: _Settings, prepared: Any, index: Any, q: Any, lower: Any, upper: Any, warm: Any
-) -> Any:
+def _solve_box(settings: _Settings, qp: _Qp) -> Solution:
+    """Step 1."""
     return solve(
-        prepared, q, lower, upper, warm, index=index, method=settings.box_method,
+        qp.prepared, qp.q, qp.lower, qp.upper, qp.warm, index=qp.which, method=settings.box_method,
         tolerance=settings.tolerance, max_iterations=settings.max_iterations,
     )  # fmt: skip
 
 
-def _with_rows(
-    settings: _Settings,
-    box: Any,
-    prepared: Prepared,
-    index: Any,
-    q: Array,
-    C: Array,
-    row_lower: Array,
-    row_upper: Array,
-    lower: Array,
-    upper: Array,
-    warm: Any,
-) -> tuple[BoxRowSolution, Array]:
+def _with_rows(settings: _Settings, box: Solution, qp: _Qp) -> tuple[BoxRowSolution, Array]:
     """Steps 2 and 3; and the multipliers (m + n,), zero where the rows hold."""
-    del warm
-    d = prepared.scale if index is None else prepared.scale[index]
-    error = rows_error(C, row_lower, row_upper, d, box.x)
+    prepared, q, C = qp.prepared, qp.q, qp.C
+    d = prepared.scale if qp.which is None else prepared.scale[qp.which]
+    error = rows_error(C, qp.row_lower, qp.row_upper, d, box.x)
     tolerance = max(settings.tolerance, 20.0 * float(jnp.finfo(q.dtype).eps))
     faulty = box.status > Status.ITERATION_LIMIT
     # Written so that NaN counts as a violation: the whole problem then says what is wrong.
     violated = ~faulty & ~((error <= tolerance) & (box.status == Status.SOLVED))
     y = jnp.zeros((C.shape[0] + q.shape[0],), q.dtype)
     residual = jnp.where(faulty, box.residual, jnp.maximum(box.residual, error))
-    hessian = (prepared.H, prepared.scale)
     x, y, status, residual, iterations = where_needed(
         violated,
         partial(_solve_whole, settings),
         (box.x, y, box.status, residual, box.iterations),
-        hessian,
-        index,
-        q,
-        C,
-        row_lower,
-        row_upper,
-        lower,
-        upper,
+        (prepared.H, prepared.scale),
+        qp.which,
+        qp.q,
+        qp.C,
+        (qp.row_lower, qp.row_upper, qp.lower, qp.upper),
     )
     solution = BoxRowSolution(x, status, residual, iterations, violated, box.warm)
     return solution, y
 
 
 def _solve_whole(
-    settings: _Settings, value: Any, hessian: Any, index: Any, q: Array, C: Array, *bounds: Array
+    settings: _Settings, value: Any, hessian: Any, index: Any, q: Array, C: Array, bounds: Any
 ) -> Any:
     """Step 3."""
     H, d = hessian if index is None else jax.tree.map(lambda a: a[index], hessian)
+    row_lower, row_upper, lower, upper = bounds
     found = solve_rows(
-        H / (d[:, None] * d), q, C, bounds[0], bounds[1], bounds[2], bounds[3], value[0],
+        H / (d[:, None] * d), q, C, row_lower, row_upper, lower, upper, value[0],
         method=settings.row_method,
         tolerance=settings.tolerance,
         max_iterations=settings.max_iterations,
@@ -170,29 +175,29 @@ def _solve_whole(
 
 @_differentiable.defjvp
 def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    prepared, index, q, C, row_lower, row_upper, lower, upper, warm = primals
-    d_prepared, _, dq, dC, d_row_lower, d_row_upper, d_lower, d_upper, _ = tangents
+    (qp,), (d_qp,) = primals, tangents
+    # An index has no tangent.
+    change = d_qp._replace(which=qp.which)
     box, d_box = jax.jvp(
-        lambda p, q, lower, upper: _solve_box(settings, p, index, q, lower, upper, warm),
-        (prepared, q, lower, upper),
-        (d_prepared, dq, d_lower, d_upper),
+        lambda p, q, lower, upper: _solve_box(
+            settings, qp._replace(prepared=p, q=q, lower=lower, upper=upper)
+        ),
+        (qp.prepared, qp.q, qp.lower, qp.upper),
+        (change.prepared, change.q, change.lower, change.upper),
     )
-    solution, y = _with_rows(settings, box, *primals)
-    H, d, dH = prepared.H, prepared.scale, d_prepared.H
-    if index is not None:
-        H, d, dH = H[index], d[index], dH[index]
-    low, high = jnp.concatenate([row_lower, lower]), jnp.concatenate([row_upper, upper])
-    d_low, d_high = jnp.concatenate([d_row_lower, d_lower]), jnp.concatenate([d_row_upper, d_upper])
-    good = solution.violated & (solution.status <= Status.ITERATION_LIMIT)
+    solution, y = _with_rows(settings, box, qp)
+    d = qp.prepared.scale if qp.which is None else qp.prepared.scale[qp.which]
     units = d[:, None] * d
+    data, change = (one._replace(H=one.H / units) for one in (qp.stacked(), change.stacked()))
+    good = solution.violated & (solution.status <= Status.ITERATION_LIMIT)
     x = solution.x
-    equations = active_equations(H / units, q, C, low, high, x, y, good)
+    equations = active_equations(data, x, y, good)
     equations, y, x = jax.lax.stop_gradient((equations, y, x))
-    n, M = q.shape[0], y.shape[0]
+    n, M = qp.q.shape[0], y.shape[0]
     # dx = by_dual r_dual + by_primal r_primal; the matrices are made for members that need them.
-    empty = jnp.zeros((n, n), q.dtype), jnp.zeros((n, M), q.dtype)
+    empty = jnp.zeros((n, n), qp.q.dtype), jnp.zeros((n, M), qp.q.dtype)
     by_dual, by_primal = where_needed(good, _inverse, empty, equations.H, equations.A)
-    r_dual, r_primal = equations.right_sides(dH / units, dq, dC, d_low, d_high, x, y)
+    r_dual, r_primal = equations.right_sides(change, x, y)
     dx = (by_dual @ r_dual + by_primal @ r_primal) * equations.unit_x
     dx = jnp.where(solution.violated, jnp.where(good, dx, 0.0), d_box.x)
     return solution, jax.tree.map(no_tangent, solution)._replace(x=dx)

@@ -11,18 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from kjax.qp.problem import Prepared, box_error
-
-
-class _Box(NamedTuple):
-    """Scaled problem data that is not in ``Prepared``."""
-
-    q: Float[Array, "n"]
-    lower: Float[Array, "n"]
-    upper: Float[Array, "n"]
-
-    def clip(self, x: Array) -> Array:
-        return jnp.clip(x, self.lower, self.upper)
+from kjax.qp.problem import Prepared, ScaledBox
 
 
 class _Iteration(NamedTuple):
@@ -38,7 +27,7 @@ class _PgState(NamedTuple):
     t: Array
 
 
-def _projected_gradient(prepared: Prepared, box: _Box) -> _Iteration:
+def _projected_gradient(prepared: Prepared, box: ScaledBox) -> _Iteration:
     """Nesterov's momentum with gradient restart (O'Donoghue and Candes 2015)."""
 
     def init(x: Array) -> _PgState:
@@ -63,7 +52,7 @@ class _AdmmState(NamedTuple):
     dual: Array
 
 
-def _admm(prepared: Prepared, box: _Box) -> _Iteration:
+def _admm(prepared: Prepared, box: ScaledBox) -> _Iteration:
     """Over-relaxed ADMM with the penalty sqrt(eig_min eig_max) (Ghadimi et al. 2015)."""
     relax = 1.6
 
@@ -83,22 +72,16 @@ FIRST_ORDER = {"admm": _admm, "projected_gradient": _projected_gradient}
 
 
 def descend(
-    method: Callable[[Prepared, _Box], _Iteration],
+    method: Callable[[Prepared, ScaledBox], _Iteration],
     prepared: Prepared,
-    q: Float[Array, "n"],
-    lower: Float[Array, "n"],
-    upper: Float[Array, "n"],
+    box: ScaledBox,
     x: Float[Array, "n"],
     *,
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Array, "n"], Float[Array, ""], Int[Array, ""]]:
     """Best point, its residual and the iterations spent; all in scaled coordinates."""
-    box = _Box(q=q, lower=lower, upper=upper)
     iteration = method(prepared, box)
-
-    def residual(x: Array) -> Array:
-        return box_error(prepared.H, box.q, box.lower, box.upper, x)
 
     def unfinished(carry: Any) -> Array:
         _, _, error, count = carry
@@ -107,7 +90,7 @@ def descend(
     def advance(carry: Any) -> Any:
         state, best, best_error, count = carry
         state = iteration.step(state)
-        error = residual(state.x)
+        error = box.residual(state.x)
         better = error < best_error
         best = jnp.where(better, state.x, best)
         return state, best, jnp.where(better, error, best_error), count + 1
@@ -115,7 +98,7 @@ def descend(
     # Start from the better of the warm start and the clipped unconstrained minimiser. Where no
     # bound is active, the common case of a walking robot, the latter is the solution.
     warm_start, free_minimiser = box.clip(x), box.clip(-(prepared.inverse @ box.q))
-    warm_error, free_error = residual(warm_start), residual(free_minimiser)
+    warm_error, free_error = box.residual(warm_start), box.residual(free_minimiser)
     x0 = jnp.where(free_error < warm_error, free_minimiser, warm_start)
     _, best, error, count = jax.lax.while_loop(
         unfinished,

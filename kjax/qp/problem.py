@@ -78,6 +78,23 @@ class Prepared(NamedTuple):
         return self.eig_max / self.eig_min
 
 
+class ScaledBox(NamedTuple):
+    """The box QP in scaled coordinates."""
+
+    H: Float[Array, "n n"]
+    q: Float[Array, "n"]
+    lower: Float[Array, "n"]
+    upper: Float[Array, "n"]
+
+    def clip(self, x: Array) -> Array:
+        """The nearest point of the box."""
+        return jnp.clip(x, self.lower, self.upper)
+
+    def residual(self, x: Array) -> Array:
+        """``box_error`` of a point of the box."""
+        return box_error(self.H, self.q, self.lower, self.upper, x)
+
+
 class Warm(NamedTuple):
     """Where the next solve with the same ``Prepared`` may start; data, to be carried.
 

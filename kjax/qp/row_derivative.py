@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kjax.qp.row_problem import scale_rows
+from kjax.qp.row_problem import RowData, scale_rows
 
 
 class ActiveEquations(NamedTuple):
@@ -31,10 +31,9 @@ class ActiveEquations(NamedTuple):
     unit_row: Float[Array, "M"]
     unit_cost: Float[Array, ""]
 
-    def right_sides(
-        self, dH: Array, dq: Array, dC: Array, d_low: Array, d_high: Array, x: Array, y: Array
-    ) -> tuple[Array, Array]:
+    def right_sides(self, change: RowData, x: Array, y: Array) -> tuple[Array, Array]:
         """r_dual (n,) and r_primal (M,) of a change of the data; linear in it."""
+        dH, dq, dC, d_low, d_high = change
         wanted = jnp.where(self.at_low, d_low, d_high)
         r_primal = wanted - jnp.concatenate([dC @ x, jnp.zeros_like(dq)])
         r_dual = 0.5 * (dH + dH.T) @ x + dq + dC.T @ y[: dC.shape[0]]
@@ -45,19 +44,15 @@ class ActiveEquations(NamedTuple):
 
 
 def active_equations(
-    H: Float[Array, "n n"],
-    q: Float[Array, "n"],
-    C: Float[Array, "m n"],
-    low: Float[Array, "M"],
-    high: Float[Array, "M"],
-    x: Float[Array, "n"],
-    y: Float[Array, "M"],
-    good: Bool[Array, ""],
+    data: RowData, x: Float[Array, "n"], y: Float[Array, "M"], good: Bool[Array, ""]
 ) -> ActiveEquations:
     """Equations at a solution x, y; those of another, harmless problem where it is not good."""
+    H, q, C, low, high = data
     n = q.shape[0]
     symmetric = jnp.where(good, 0.5 * (H + H.T), jnp.eye(n, dtype=H.dtype))
-    _, scaling = scale_rows(symmetric, *(jnp.where(good, a, 0.0) for a in (q, C, low, high)))
+    _, scaling = scale_rows(
+        RowData(symmetric, *(jnp.where(good, a, 0.0) for a in (q, C, low, high)))
+    )
     A = jnp.concatenate([jnp.where(good, C, 0.0), jnp.eye(n, dtype=q.dtype)])
     # A side is active where its multiplier, in units of the objective, outweighs its slack.
     value = A @ x

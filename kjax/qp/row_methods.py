@@ -5,7 +5,7 @@ with ``kkt_errors`` of just that point.
 """
 
 from enum import IntEnum
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from kjax.qp.certificates import Verdict, classify, proves_infeasible
 from kjax.qp.interior import descend_central_path
 from kjax.qp.polish import polish
 from kjax.qp.row_problem import (
+    RowData,
     RowProblem,
     RowScaling,
     contradicts,
@@ -52,15 +53,29 @@ class RowSettings(NamedTuple):
     max_iterations: int
 
 
-class RowData(NamedTuple):
-    """The caller's problem, faulty data replaced; H symmetric, the box's bounds last."""
+class Posed(NamedTuple):
+    """A problem as the methods take it.
 
-    H: Array
-    q: Array
-    C: Array
-    low: Array
-    high: Array
+    Attributes:
+      problem: scaled.
+      scaling: back to the caller's units.
+      data: the caller's problem, faulty data replaced.
+      good: whether nothing had to be replaced; else nothing is done.
+    """
+
+    problem: RowProblem
+    scaling: RowScaling
+    data: RowData
     good: Array
+
+
+class Judged(NamedTuple):
+    """A point in the caller's units, and how good it is; see ``Found``."""
+
+    x: Array
+    y: Array
+    error: Array
+    margin: Array
 
 
 class Found(NamedTuple):
@@ -99,19 +114,27 @@ class Evidence(NamedTuple):
     scaling: RowScaling
 
 
-def by_active_set(
-    settings: RowSettings, problem: RowProblem, scaling: RowScaling, data: RowData
-) -> tuple[Found, Evidence]:
+def pose(data: RowData, good: Array, *, equilibrate: bool = True) -> Posed:
+    """Step 1: the problem scaled, see ``scale_rows``."""
+    problem, scaling = scale_rows(data, equilibrate=equilibrate)
+    return Posed(problem, scaling, data, good)
+
+
+def by_active_set(settings: RowSettings, posed: Posed) -> tuple[Found, Evidence]:
     """Dual active set; H must be positive definite. ``infeasible`` is claimed, not yet proven."""
     state, definite = solve_active_set(
-        problem, data.good, 0.1 * settings.tolerance, settings.max_iterations
+        posed.problem, posed.good, 0.1 * settings.tolerance, settings.max_iterations
     )
-    found = _judge(
-        problem, scaling, data, state.x, state.multipliers,
-        state.bound_status > 0, state.bound_status < 0, usable=definite | ~data.good,
-        infeasible=state.infeasible, iterations=state.iterations, method=MethodUsed.ACTIVE_SET,
-    )  # fmt: skip
-    return found, Evidence(state, problem, scaling)
+    usable = definite | ~posed.good
+    at_low, at_high = state.bound_status > 0, state.bound_status < 0
+    found = Found(
+        *_judge(posed, state.x, state.multipliers, at_low, at_high),
+        usable=usable,
+        infeasible=state.infeasible,
+        iterations=state.iterations,
+        method=_used(MethodUsed.ACTIVE_SET),
+    )
+    return found, Evidence(state, posed.problem, posed.scaling)
 
 
 def proven_by_active_set(
@@ -120,69 +143,71 @@ def proven_by_active_set(
     """Whether what the active set claims of an unsolved problem is proven."""
     state, problem, scaling = evidence
     claimed = state.infeasible & proves_infeasible(problem, farkas(problem, state))
-    contradicted = contradicts(scaling, data.C, data.low, data.high, settings.tolerance)
+    contradicted = contradicts(scaling, data, settings.tolerance)
     return found.usable & (claimed | contradicted)
 
 
-def by_interior_point(
-    settings: RowSettings, problem: RowProblem, scaling: RowScaling, data: RowData
-) -> Found:
+def by_interior_point(settings: RowSettings, posed: Posed) -> Found:
     """Primal-dual interior point; H may be singular."""
-    usable = _semidefinite(problem) | ~data.good
+    usable = _semidefinite(posed.problem) | ~posed.good
     x, y, count = descend_central_path(
-        problem,
-        data.good & usable,
+        posed.problem,
+        posed.good & usable,
         tolerance=0.5 * settings.tolerance,
         max_iterations=settings.max_iterations,
     )
-    return _judge_or_polish(
-        settings, problem, scaling, data, x, y, usable=usable, infeasible=jnp.zeros((), bool),
-        iterations=count, method=MethodUsed.INTERIOR_POINT,
-    )  # fmt: skip
+    found = Found(
+        *_judge_inside(posed, x, y),
+        usable=usable,
+        infeasible=jnp.zeros((), bool),
+        iterations=count,
+        method=_used(MethodUsed.INTERIOR_POINT),
+    )
+    return _polish_where_needed(settings, posed, found, x, y)
 
 
-def by_splitting(
-    settings: RowSettings,
-    problem: RowProblem,
-    scaling: RowScaling,
-    data: RowData,
-    warm: Array | None,
-) -> Found:
+def by_splitting(settings: RowSettings, posed: Posed, warm: Array | None) -> Found:
     """ADMM on the rows (the splitting of OSQP); H may be singular."""
-    usable = _semidefinite(problem) | ~data.good
+    problem, scaling = posed.problem, posed.scaling
+    usable = _semidefinite(problem) | ~posed.good
     if warm is not None:
         warm = jnp.where(jnp.isfinite(warm), warm - scaling.at, 0.0) / scaling.x
         warm = jnp.where(scaling.fixed, 0.0, warm)
     result = solve_splitting(
         problem,
-        data.good & usable,
+        posed.good & usable,
         warm,
         tolerance=0.5 * settings.tolerance,
         max_iterations=settings.max_iterations,
     )
-    return _judge_or_polish(
-        settings, problem, scaling, data, result.x, result.multipliers, usable=usable,
-        infeasible=result.infeasible, iterations=result.iterations, method=MethodUsed.ADMM,
-    )  # fmt: skip
+    found = Found(
+        *_judge_inside(posed, result.x, result.multipliers),
+        usable=usable,
+        infeasible=result.infeasible,
+        iterations=result.iterations,
+        method=_used(MethodUsed.ADMM),
+    )
+    return _polish_where_needed(settings, posed, found, result.x, result.multipliers)
 
 
-def better_by_interior_point(settings: RowSettings, old: Found, data: RowData) -> Found:
+def better_by_interior_point(
+    settings: RowSettings, old: Found, data: RowData, good: Array
+) -> Found:
     """The old point, or the interior point's where that is better or the old has no use."""
-    problem, scaling = scale_rows(*data[:5])
-    new = by_interior_point(settings, problem, scaling, data)
+    new = by_interior_point(settings, pose(data, good))
     new = new._replace(iterations=old.iterations + new.iterations)
     keep = old.usable & (jnp.max(old.error) <= jnp.max(new.error))
     return jax.tree.map(lambda a, b: jnp.where(keep, a, b), old, new)
 
 
-def classified(tolerance: float, old: Verdict, data: RowData) -> Verdict:
+def classified(tolerance: float, old: Verdict, data: RowData, good: Array) -> Verdict:
     """Step 4: whether the problem is proven infeasible or unbounded, with a finite point."""
     del old
-    problem, scaling = scale_rows(*data[:5])
-    verdict = classify(problem, data.good)
+    problem, scaling = scale_rows(data)
+    verdict = classify(problem, good)
     m = data.C.shape[0]
     x = jnp.clip(verdict.x * scaling.x + scaling.at, data.low[m:], data.high[m:])
-    contradicted = contradicts(scaling, data.C, data.low, data.high, tolerance)
+    contradicted = contradicts(scaling, data, tolerance)
     return Verdict(verdict.infeasible | contradicted, verdict.unbounded & ~contradicted, x)
 
 
@@ -195,53 +220,33 @@ def _semidefinite(problem: RowProblem) -> Array:
     return jnp.isfinite(jnp.linalg.cholesky(H + ridge)).all()
 
 
-def _judge_or_polish(
-    settings: RowSettings,
-    problem: RowProblem,
-    scaling: RowScaling,
-    data: RowData,
-    x: Array,
-    y: Array,
-    *,
-    usable: Array,
-    infeasible: Array,
-    iterations: Array,
-    method: MethodUsed,
-) -> Found:
-    """The judged point; polished on its active rows where it is not good enough as it is."""
-    never = jnp.zeros_like(problem.has_low)
-    found = _judge(
-        problem, scaling, data, x, y, never, never,
-        usable=usable, infeasible=infeasible, iterations=iterations, method=method,
-    )  # fmt: skip
+def _used(method: MethodUsed) -> Array:
+    return jnp.asarray(method, jnp.int32)
 
-    def polished(old: Found, problem: Any, scaling: Any, data: Any, x: Array, y: Array) -> Found:
-        fine = _judge(
-            problem, scaling, data, *polish(problem, x, y), usable=old.usable,
-            infeasible=old.infeasible, iterations=old.iterations, method=method,
-        )  # fmt: skip
+
+def _polish_where_needed(
+    settings: RowSettings, posed: Posed, found: Found, x: Array, y: Array
+) -> Found:
+    """The point polished on its active rows where it is not good enough as it is; x, y scaled."""
+
+    def polished(old: Found, posed: Posed, x: Array, y: Array) -> Found:
+        fine = old._replace(**_judge(posed, *polish(posed.problem, x, y))._asdict())
         better = jnp.max(fine.error) < jnp.max(old.error)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), fine, old)
 
-    needed = data.good & usable & ~found.solved(settings.tolerance)
-    return where_needed(needed, polished, found, problem, scaling, data, x, y)
+    needed = posed.good & found.usable & ~found.solved(settings.tolerance)
+    return where_needed(needed, polished, found, posed, x, y)
 
 
-def _judge(
-    problem: RowProblem,
-    scaling: RowScaling,
-    data: RowData,
-    x_hat: Array,
-    y_hat: Array,
-    at_low: Array,
-    at_high: Array,
-    *,
-    usable: Array,
-    infeasible: Array,
-    iterations: Array,
-    method: MethodUsed,
-) -> Found:
+def _judge_inside(posed: Posed, x_hat: Array, y_hat: Array) -> Judged:
+    """Step 3 for a point whose active rows are not known."""
+    never = jnp.zeros_like(posed.problem.has_low)
+    return _judge(posed, x_hat, y_hat, never, never)
+
+
+def _judge(posed: Posed, x_hat: Array, y_hat: Array, at_low: Array, at_high: Array) -> Judged:
     """Step 3. A bound that is active (``at_low``, ``at_high``) is kept to the last bit."""
+    problem, scaling, data, _ = posed
     m = data.C.shape[0]
     lower, upper = data.low[m:], data.high[m:]
     x = jnp.clip(snapped(x_hat) * scaling.x + scaling.at, lower, upper)
@@ -249,9 +254,7 @@ def _judge(
     y = y_hat * scaling.multipliers
     y = jnp.where(jnp.concatenate([scaling.immovable, jnp.zeros_like(scaling.fixed)]), 0.0, y)
     d = jnp.where(scaling.fixed, 0.0, scaling.x)
-    error, y, value = kkt_errors(
-        data.H, data.q, data.C, data.low, data.high, d, scaling.values, x, y
-    )
+    error, y, value = kkt_errors(data, d, scaling.values, x, y)
     force = y / scaling.multipliers
     slack_low, slack_high = (
         (value - data.low) / scaling.values,
@@ -259,13 +262,5 @@ def _judge(
     )
     below = jnp.where(problem.has_low, jnp.maximum(slack_low, -force), jnp.inf)
     above = jnp.where(problem.has_high, jnp.maximum(slack_high, force), jnp.inf)
-    return Found(
-        x=x,
-        y=y,
-        error=error,
-        margin=jnp.min(jnp.minimum(below, above), initial=jnp.inf),
-        usable=usable,
-        infeasible=infeasible,
-        iterations=iterations,
-        method=jnp.asarray(method, jnp.int32),
-    )
+    margin = jnp.min(jnp.minimum(below, above), initial=jnp.inf)
+    return Judged(x=x, y=y, error=error, margin=margin)

@@ -11,6 +11,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
+class RowData(NamedTuple):
+    """A problem in the caller's units, or a change of one; H symmetric, the box's bounds last."""
+
+    H: Float[Array, "n n"]
+    q: Float[Array, "n"]
+    C: Float[Array, "m n"]
+    low: Float[Array, "M"]
+    high: Float[Array, "M"]
+
+
 class RowProblem(NamedTuple):
     """Scaled problem; the box's rows follow those of C."""
 
@@ -44,10 +54,10 @@ class RowProblem(NamedTuple):
 
     def errors(self, x: Array, y: Array) -> Array:
         """``kkt_errors`` of a point and its multipliers."""
-        low, high = self.bounds()
-        one = jnp.ones_like(low)
+        data = RowData(self.H, self.q, self.C, *self.bounds())
+        one = jnp.ones_like(data.low)
         x = snapped(x)
-        return kkt_errors(self.H, self.q, self.C, low, high, one[: len(x)], one, x, y)[0]
+        return kkt_errors(data, one[: len(x)], one, x, y)[0]
 
 
 class RowScaling(NamedTuple):
@@ -99,19 +109,12 @@ def variable_units(
     return d
 
 
-def scale_rows(
-    H: Float[Array, "n n"],
-    q: Float[Array, "n"],
-    C: Float[Array, "m n"],
-    low: Float[Array, "M"],
-    high: Float[Array, "M"],
-    *,
-    equilibrate: bool = True,
-) -> tuple[RowProblem, RowScaling]:
-    """Scaled problem of finite data with consistent bounds; H symmetric.
+def scale_rows(data: RowData, *, equilibrate: bool = True) -> tuple[RowProblem, RowScaling]:
+    """Scaled problem of finite data with consistent bounds.
 
     ``equilibrate`` is for variables without curvature, whose unit then comes from the rows.
     """
+    H, q, C, low, high = data
     m = C.shape[0]
     fixed = low[m:] == high[m:]
     free = ~fixed
@@ -176,11 +179,7 @@ def _expected_size(slope: Array, h: Array, low: Array, high: Array, off: Array, 
 
 
 def kkt_errors(
-    H: Float[Array, "n n"],
-    q: Float[Array, "n"],
-    C: Float[Array, "m n"],
-    low: Float[Array, "M"],
-    high: Float[Array, "M"],
+    data: RowData,
     d: Float[Array, "n"],
     units: Float[Array, "M"],
     x: Float[Array, "n"],
@@ -199,6 +198,7 @@ def kkt_errors(
     its bound is the rest of its equation: the multipliers that come back are those judged; the
     values (m + n,) of rows and box follow.
     """
+    H, q, C, low, high = data
     m, n = C.shape
     rounding = 4.0 * n**0.5 * float(jnp.finfo(q.dtype).eps)
     y = jnp.where(jnp.where(y > 0, high < jnp.inf, low > -jnp.inf), y, 0.0)
@@ -247,12 +247,10 @@ def kkt_errors(
     return error, y, jnp.concatenate([value, x])
 
 
-def contradicts(
-    scaling: RowScaling, C: Float[Array, "m n"], low: Array, high: Array, tolerance: float
-) -> Bool[Array, ""]:
+def contradicts(scaling: RowScaling, data: RowData, tolerance: float) -> Bool[Array, ""]:
     """Whether a row that no free variable can move breaks its bound."""
-    m = C.shape[0]
-    low, high, value = low[:m], high[:m], C @ scaling.at
+    C, m = data.C, data.C.shape[0]
+    low, high, value = data.low[:m], data.high[:m], C @ scaling.at
     over = jnp.maximum(low - value, value - high)
     bound = jnp.where(over > 0, jnp.where(low > value, low, high), 0.0)
     terms = jnp.abs(bound) + jnp.abs(C) @ jnp.abs(scaling.at)

@@ -32,7 +32,6 @@ from kjax.qp.row_methods import (
     ROW_METHODS,
     Evidence,
     Found,
-    RowData,
     RowMethod,
     RowSettings,
     better_by_interior_point,
@@ -40,9 +39,10 @@ from kjax.qp.row_methods import (
     by_interior_point,
     by_splitting,
     classified,
+    pose,
     proven_by_active_set,
 )
-from kjax.qp.row_problem import scale_rows
+from kjax.qp.row_problem import RowData
 
 
 class RowSolution(NamedTuple):
@@ -89,6 +89,8 @@ def solve_rows(
 ) -> RowSolution:
     """Minimiser of 1/2 x^T H x + q^T x within rows and box; see the module's head.
 
+    Eleven arguments: the problem's seven matrices as in any QP library, and options by keyword.
+
     Args:
       H: (n, n) positive semidefinite, for ``"active_set"`` definite; its symmetric part is used.
       q: (n,) linear term.
@@ -119,26 +121,42 @@ def solve_rows(
         raise ValueError(f"tolerance must be above 0, got {tolerance}")
     settings = RowSettings(method, tolerance, max_iterations)
     warm = None if warm is None else jax.lax.stop_gradient(warm)
-    return _differentiable(settings, warm, H, q, C, row_lower, row_upper, lower, upper)
+    return _differentiable(settings, warm, _Qp(H, q, C, row_lower, row_upper, lower, upper))
+
+
+class _Qp(NamedTuple):
+    """The caller's problem, or a change of it."""
+
+    H: Array
+    q: Array
+    C: Array
+    row_lower: Array
+    row_upper: Array
+    lower: Array
+    upper: Array
+
+    def stacked(self) -> RowData:
+        """Bounds of rows and box in one."""
+        low = jnp.concatenate([self.row_lower, self.lower])
+        high = jnp.concatenate([self.row_upper, self.upper])
+        return RowData(self.H, self.q, self.C, low, high)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _differentiable(settings: RowSettings, warm: Array | None, *data: Array) -> RowSolution:
-    return _solve(settings, warm, *data)
+def _differentiable(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
+    return _solve(settings, warm, qp)
 
 
 @_differentiable.defjvp
 def _derivative(settings: RowSettings, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    _, H, q, C, row_lower, row_upper, lower, upper = primals
-    _, dH, dq, dC, d_row_lower, d_row_upper, d_lower, d_upper = tangents
-    solution = _differentiable(settings, *primals)
-    low, high = jnp.concatenate([row_lower, lower]), jnp.concatenate([row_upper, upper])
-    d_low, d_high = jnp.concatenate([d_row_lower, d_lower]), jnp.concatenate([d_row_upper, d_upper])
+    warm, qp = primals
+    _, d_qp = tangents
+    solution = _differentiable(settings, warm, qp)
+    data, change = qp.stacked(), d_qp.stacked()
     good = solution.status <= Status.ITERATION_LIMIT
     x, y = solution.x, solution.multipliers
-    equations = jax.lax.stop_gradient(active_equations(H, q, C, low, high, x, y, good))
-    right = equations.right_sides(dH, dq, dC, d_low, d_high, x, y)
-    dx, dy = solve_equations(equations.H, equations.A, *right)
+    equations = jax.lax.stop_gradient(active_equations(data, x, y, good))
+    dx, dy = solve_equations(equations.H, equations.A, *equations.right_sides(change, x, y))
     still = jax.tree.map(no_tangent, solution)
     return solution, still._replace(
         x=jnp.where(good, dx * equations.unit_x, 0.0),
@@ -146,56 +164,37 @@ def _derivative(settings: RowSettings, primals: Any, tangents: Any) -> tuple[Any
     )
 
 
-def _solve(
-    settings: RowSettings,
-    warm: Array | None,
-    H: Array,
-    q: Array,
-    C: Array,
-    row_lower: Array,
-    row_upper: Array,
-    lower: Array,
-    upper: Array,
-) -> RowSolution:
-    n = q.shape[0]
-    tolerance = max(settings.tolerance, 20.0 * float(jnp.finfo(q.dtype).eps))
-    low, high = jnp.concatenate([row_lower, lower]), jnp.concatenate([row_upper, upper])
-    finite = jnp.stack([jnp.isfinite(a).all() for a in (H, q, C)]).all()
-    finite = finite & ~(jnp.isnan(low) | jnp.isnan(high)).any()
-    consistent = ((low <= high) & (low < jnp.inf) & (high > -jnp.inf)).all()
-    sound = finite & consistent
-    data = RowData(
-        jnp.where(sound, 0.5 * (H + H.T), jnp.eye(n, dtype=H.dtype)),
-        jnp.where(sound, q, 0.0),
-        jnp.where(sound, C, 0.0),
-        jnp.where(sound, low, -jnp.inf),
-        jnp.where(sound, high, jnp.inf),
-        sound,
-    )
+def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
+    least = 20.0 * float(jnp.finfo(qp.q.dtype).eps)
+    settings = settings._replace(tolerance=max(settings.tolerance, least))
+    data, good, finite, consistent = _checked(qp.stacked())
     # step 1; the active set wants curvature everywhere, and needs no other units then
     by_curvature = settings.method in ("auto", "active_set")
-    problem, scaling = scale_rows(*data[:5], equilibrate=not by_curvature)
-    inner = settings._replace(tolerance=tolerance)
+    posed = pose(data, good, equilibrate=not by_curvature)
     evidence = None
-    if settings.method == "interior_point":  # step 2
-        found = by_interior_point(inner, problem, scaling, data)
+    if settings.method == "interior_point":  # steps 2 and 3
+        found = by_interior_point(settings, posed)
     elif settings.method == "admm":
-        found = by_splitting(inner, problem, scaling, data, warm)
+        found = by_splitting(settings, posed, warm)
     else:
-        found, evidence = by_active_set(inner, problem, scaling, data)
+        found, evidence = by_active_set(settings, posed)
     # One branch for all that an unsolved problem needs: each costs a call more than a microsecond.
-    solved_at_once = found.usable & found.solved(tolerance)
+    solved_at_once = found.usable & found.solved(settings.tolerance)
     verdict = Verdict(jnp.zeros((), bool), jnp.zeros((), bool), found.x)
     found, verdict = where_needed(
-        data.good & ~solved_at_once, partial(_unsolved, inner), (found, verdict), data, evidence
+        posed.good & ~solved_at_once,
+        partial(_unsolved, settings),
+        (found, verdict),
+        posed.data,
+        posed.good,
+        evidence,
     )
-    solved = found.solved(tolerance)
     status = jnp.select(
         [
             ~finite,
             ~consistent,
             ~found.usable,
-            solved,
+            found.solved(settings.tolerance),
             verdict.infeasible,
             verdict.unbounded,
         ],
@@ -209,19 +208,12 @@ def _solve(
         ],
         Status.ITERATION_LIMIT,
     )
-    usable = data.good & found.usable
-    # Whatever the data, the point is finite and inside the bounds that make sense.
-    inside, outside = (
-        jnp.where(consistent & ~jnp.isnan(bound), bound, end)
-        for bound, end in ((lower, -jnp.inf), (upper, jnp.inf))
-    )
-    x = jnp.where(usable, jnp.where(verdict.unbounded, verdict.x, found.x), scaling.at)
-    x = jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), inside, outside)
+    usable = posed.good & found.usable
+    x = jnp.where(usable, jnp.where(verdict.unbounded, verdict.x, found.x), posed.scaling.at)
     error = jnp.where(usable, found.error, jnp.inf)
-    y = jnp.where(usable & jnp.isfinite(found.y), found.y, 0.0)
     return RowSolution(
-        x=x,
-        multipliers=y,
+        x=_inside(x, qp, consistent),
+        multipliers=jnp.where(usable & jnp.isfinite(found.y), found.y, 0.0),
         status=status.astype(jnp.int32),
         primal=error[0],
         dual=error[1],
@@ -232,8 +224,38 @@ def _solve(
     )
 
 
+def _checked(data: RowData) -> tuple[RowData, Array, Array, Array]:
+    """Symmetric data, harmless where faulty; whether it is good, finite, of consistent bounds."""
+    H, q, C, low, high = data
+    finite = jnp.stack([jnp.isfinite(a).all() for a in (H, q, C)]).all()
+    finite = finite & ~(jnp.isnan(low) | jnp.isnan(high)).any()
+    consistent = ((low <= high) & (low < jnp.inf) & (high > -jnp.inf)).all()
+    good = finite & consistent
+    safe = RowData(
+        jnp.where(good, 0.5 * (H + H.T), jnp.eye(q.shape[0], dtype=H.dtype)),
+        jnp.where(good, q, 0.0),
+        jnp.where(good, C, 0.0),
+        jnp.where(good, low, -jnp.inf),
+        jnp.where(good, high, jnp.inf),
+    )
+    return safe, good, finite, consistent
+
+
+def _inside(x: Array, qp: _Qp, consistent: Array) -> Array:
+    """A finite point inside the bounds that make sense, whatever the data."""
+    inside, outside = (
+        jnp.where(consistent & ~jnp.isnan(bound), bound, end)
+        for bound, end in ((qp.lower, -jnp.inf), (qp.upper, jnp.inf))
+    )
+    return jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), inside, outside)
+
+
 def _unsolved(
-    settings: RowSettings, old: tuple[Found, Verdict], data: RowData, evidence: Evidence | None
+    settings: RowSettings,
+    old: tuple[Found, Verdict],
+    data: RowData,
+    good: Array,
+    evidence: Evidence | None,
 ) -> tuple[Found, Verdict]:
     """Another method for what ``"auto"`` has not solved, then step 4."""
     found, verdict = old
@@ -247,6 +269,7 @@ def _unsolved(
             partial(better_by_interior_point, settings),
             found,
             data,
+            good,
         )
     verdict = verdict._replace(infeasible=infeasible)
     if settings.method != "active_set":
@@ -255,5 +278,6 @@ def _unsolved(
             partial(classified, settings.tolerance),
             verdict,
             data,
+            good,
         )
     return found, verdict

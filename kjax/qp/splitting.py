@@ -11,6 +11,7 @@ With v = A x split off, A the rows of C and the box, penalties rho_i, sigma and 
 5. Balance primal and dual residuals by rho, and go to step 1.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -56,6 +57,21 @@ class _State(NamedTuple):
     spent: Int[Array, ""]
 
 
+class _Rows(NamedTuple):
+    """The problem with its bounds, and the weight of each row in rho."""
+
+    problem: RowProblem
+    low: Float[Array, "M"]
+    high: Float[Array, "M"]
+    weight: Float[Array, "M"]
+
+    def judged(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """The point in the box, and its largest error."""
+        m = self.problem.C.shape[0]
+        x = jnp.clip(x, self.low[m:], self.high[m:])
+        return x, jnp.max(self.problem.errors(x, y))
+
+
 def solve_splitting(
     problem: RowProblem,
     good: Array,
@@ -69,61 +85,8 @@ def solve_splitting(
     low, high = problem.bounds()
     free = (low == -jnp.inf) & (high == jnp.inf)
     weight = jnp.where(problem.equal, 1e3, jnp.where(free, 1e-6, 1.0)).astype(dtype)
+    rows = _Rows(problem, low, high, weight)
     x0 = jnp.zeros((n,), dtype) if warm is None else warm
-
-    def judged(x: Array, y: Array) -> tuple[Array, Array]:
-        x = jnp.clip(x, low[m:], high[m:])
-        return x, jnp.max(problem.errors(x, y))
-
-    def unfinished(state: _State) -> Array:
-        return ~state.stop & (state.spent < max_iterations)
-
-    def advance(state: _State) -> _State:
-        rho = state.rho * weight
-        K = problem.H + SIGMA * jnp.eye(n, dtype=dtype) + problem.gram(rho)  # step 1
-        half = solve_triangular(jnp.linalg.cholesky(K), jnp.eye(n, dtype=dtype), lower=True)
-
-        def step(_: Any, carry: Any) -> Any:  # step 2
-            x, v, y, _, _ = carry
-            right = SIGMA * x - problem.q + problem.adjoint(rho * v - y)
-            new_x = half.T @ (half @ right)
-            mixed = ALPHA * problem.rows(new_x) + (1.0 - ALPHA) * v
-            new_v = jnp.clip(mixed + y / rho, low, high)
-            return ALPHA * new_x + (1.0 - ALPHA) * x, new_v, y + rho * (mixed - new_v), x, y
-
-        steps = jnp.minimum(CHECK, max_iterations - state.spent)
-        carry = (state.x, state.v, state.y, state.x, state.y)
-        x, v, y, old_x, old_y = jax.lax.fori_loop(0, steps, step, carry)
-
-        plain_x, plain_error = judged(x, y)  # step 3
-        fine_x, fine_y, _, _ = polish(problem, x, y)
-        fine_x, fine_error = judged(fine_x, fine_y)
-        polished = fine_error < plain_error
-        new_x = jnp.where(polished, fine_x, plain_x)
-        new_y = jnp.where(polished, fine_y, y)
-        new_error = jnp.where(polished, fine_error, plain_error)
-        better = new_error < state.error
-        error = jnp.where(better, new_error, state.error)
-        infeasible = proves_infeasible(problem, y - old_y)  # step 4
-        broken = ~(jnp.isfinite(x).all() & jnp.isfinite(y).all())
-        stop = (error <= tolerance) | infeasible | is_descent(problem, x - old_x) | broken
-
-        value = problem.rows(x)  # step 5
-        r_primal = jnp.max(jnp.abs(value - v)) / _largest(value, v)
-        push = problem.adjoint(y)
-        r_dual = jnp.max(jnp.abs(problem.H @ x + problem.q + push))
-        r_dual = r_dual / _largest(problem.H @ x, problem.q, push)
-        tiny = jnp.finfo(dtype).tiny
-        factor = jnp.sqrt(jnp.maximum(r_primal, tiny) / jnp.maximum(r_dual, tiny))
-        factor = jnp.where((factor > 5.0) | (factor < 0.2), jnp.clip(factor, 1e-3, 1e3), 1.0)
-        return _State(
-            x=x, v=v, y=y, rho=jnp.clip(state.rho * factor, 1e-6, 1e6),
-            best_x=jnp.where(better, new_x, state.best_x),
-            best_y=jnp.where(better, new_y, state.best_y),
-            error=error, infeasible=infeasible, stop=stop, spent=state.spent + steps,
-        )  # fmt: skip
-
-    never = jnp.zeros((), bool)
     start = _State(
         x=x0,
         v=jnp.clip(problem.rows(x0), low, high),
@@ -132,12 +95,74 @@ def solve_splitting(
         best_x=jnp.clip(x0, low[m:], high[m:]),
         best_y=jnp.zeros_like(low),
         error=jnp.asarray(jnp.inf, dtype),
-        infeasible=never,
+        infeasible=jnp.zeros((), bool),
         stop=~good,
         spent=jnp.zeros((), jnp.int32),
     )
-    state = jax.lax.while_loop(unfinished, advance, start)
+    state = jax.lax.while_loop(
+        lambda state: ~state.stop & (state.spent < max_iterations),
+        partial(_advance, tolerance, max_iterations, rows),
+        start,
+    )
     return Split(state.best_x, state.best_y, state.infeasible, state.spent)
+
+
+def _advance(tolerance: float, max_iterations: int, rows: _Rows, state: _State) -> _State:
+    """Steps 1 to 5."""
+    problem = rows.problem
+    steps = jnp.minimum(CHECK, max_iterations - state.spent)
+    x, v, y, old_x, old_y = _iterate(rows, state, steps)
+
+    plain_x, plain_error = rows.judged(x, y)  # step 3
+    fine_x, fine_y, _, _ = polish(problem, x, y)
+    fine_x, fine_error = rows.judged(fine_x, fine_y)
+    polished = fine_error < plain_error
+    new_x = jnp.where(polished, fine_x, plain_x)
+    new_y = jnp.where(polished, fine_y, y)
+    new_error = jnp.where(polished, fine_error, plain_error)
+    better = new_error < state.error
+    error = jnp.where(better, new_error, state.error)
+    infeasible = proves_infeasible(problem, y - old_y)  # step 4
+    broken = ~(jnp.isfinite(x).all() & jnp.isfinite(y).all())
+    stop = (error <= tolerance) | infeasible | is_descent(problem, x - old_x) | broken
+    return _State(
+        x=x, v=v, y=y, rho=jnp.clip(state.rho * _balance(problem, x, v, y), 1e-6, 1e6),
+        best_x=jnp.where(better, new_x, state.best_x),
+        best_y=jnp.where(better, new_y, state.best_y),
+        error=error, infeasible=infeasible, stop=stop, spent=state.spent + steps,
+    )  # fmt: skip
+
+
+def _iterate(rows: _Rows, state: _State, steps: Array) -> tuple[Array, ...]:
+    """Steps 1 and 2: x, v, y, and the x and y before the last iteration."""
+    problem, low, high, weight = rows
+    n, dtype = problem.q.shape[0], problem.q.dtype
+    rho = state.rho * weight
+    K = problem.H + SIGMA * jnp.eye(n, dtype=dtype) + problem.gram(rho)  # step 1
+    half = solve_triangular(jnp.linalg.cholesky(K), jnp.eye(n, dtype=dtype), lower=True)
+
+    def step(_: Any, carry: Any) -> Any:  # step 2
+        x, v, y, _, _ = carry
+        right = SIGMA * x - problem.q + problem.adjoint(rho * v - y)
+        new_x = half.T @ (half @ right)
+        mixed = ALPHA * problem.rows(new_x) + (1.0 - ALPHA) * v
+        new_v = jnp.clip(mixed + y / rho, low, high)
+        return ALPHA * new_x + (1.0 - ALPHA) * x, new_v, y + rho * (mixed - new_v), x, y
+
+    carry = (state.x, state.v, state.y, state.x, state.y)
+    return jax.lax.fori_loop(0, steps, step, carry)
+
+
+def _balance(problem: RowProblem, x: Array, v: Array, y: Array) -> Array:
+    """Step 5: the factor of rho that brings primal and dual residuals to one size."""
+    value = problem.rows(x)
+    r_primal = jnp.max(jnp.abs(value - v)) / _largest(value, v)
+    push = problem.adjoint(y)
+    r_dual = jnp.max(jnp.abs(problem.H @ x + problem.q + push))
+    r_dual = r_dual / _largest(problem.H @ x, problem.q, push)
+    tiny = jnp.finfo(x.dtype).tiny
+    factor = jnp.sqrt(jnp.maximum(r_primal, tiny) / jnp.maximum(r_dual, tiny))
+    return jnp.where((factor > 5.0) | (factor < 0.2), jnp.clip(factor, 1e-3, 1e3), 1.0)
 
 
 def _largest(*parts: Array) -> Array:
