@@ -151,8 +151,7 @@ def _condensed(spec: ControllerSpec, params: ControllerParams) -> LmpcTables:
         horizon=spec.horizon,
         feet=params.fits.feet,
         spread=params.fits.spread,
-        discount=spec.discounts_uncertainty,
-        uncertainty_discount=params.uncertainty_discount,
+        uncertainty_discount=params.uncertainty_discount if spec.discounts_uncertainty else None,
     )
 
 

@@ -205,16 +205,20 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
             settings,
             nodes,
             body.x,
-            position=task.lag,
-            velocity=task.velocity,
-            command=task.command,
-            slew=params.command_slew,
-            height=task.height,
-            ground=jnp.zeros_like(task.lag),
-            periodic=_motion(params, task, nodes.phase, nodes.cycle, nodes.place),
-            contact=_contacts(params.robot, task) + body.x[:2],
-            stance_time=schedule.duration[clock.gait, nodes.phase],
-            cycle_time=nodes.end[-1],
+            multiphase.HorizonCommand(
+                position=task.lag,
+                velocity=task.velocity,
+                target=task.command,
+                slew=params.command_slew,
+                height=task.height,
+                periodic=_motion(params, task, nodes.phase, nodes.cycle, nodes.place),
+            ),
+            multiphase.Stances(
+                ground=jnp.zeros_like(task.lag),
+                feet=_contacts(params.robot, task) + body.x[:2],
+                duration=schedule.duration[clock.gait, nodes.phase],
+                cycle=nodes.end[-1],
+            ),
         )
         solved = multiphase.solve(
             settings,
@@ -223,8 +227,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
             forecast,
             body.x,
             (body.x[:2] - body.base) @ body.rotation,
-            tolerance=spec.tolerance,
-            max_iterations=spec.max_iterations,
+            spec,
         )
         # A point that misses its rows by a percent still walks better than none; without one, the
         # feet carry what they carry in the periodic motion.

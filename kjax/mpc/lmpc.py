@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from kjax import qp
 from kjax.koopman.models import LinearModel, aggregate, input_map
-from kjax.mpc.condense import cautious_weights, condense
+from kjax.mpc.condense import CondensedQp, cautious_weights, condense
 from kjax.mpc.limits import ForceRows
 from kjax.spec import ControllerSpec
 
@@ -88,8 +88,7 @@ def build_tables(
     horizon: int,
     feet: Float[Array, "M 2 2"],
     spread: Float[Array, "M n_x"] | None = None,
-    discount: bool = False,
-    uncertainty_discount: Float[Array, ""] | float = 0.0,
+    uncertainty_discount: Float[Array, ""] | float | None = None,
 ) -> LmpcTables:
     """Tables of all contact modes; call it in float64.
 
@@ -100,8 +99,8 @@ def build_tables(
       horizon: number k of prediction steps.
       feet: (M, 2, 2) nominal contact points [m].
       spread: (M, n_x) standard deviation of the one-step error of each model; ``None`` for none.
-      discount: whether uncertain steps weigh less.
-      uncertainty_discount: by how much, see ``condense.cautious_weights`` [-].
+      uncertainty_discount: by how much uncertain steps weigh less, see
+        ``condense.cautious_weights``; ``None`` for all alike [-].
     """
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
     Q, R, lower, upper, u_ref = settings
@@ -113,7 +112,7 @@ def build_tables(
     def one(
         model: LinearModel, Q: Array, R: Array, feet: Array, swinging: Array, spread: Array
     ) -> tuple[qp.Prepared, Array, Array]:
-        if discount:
+        if uncertainty_discount is not None:
             Q = cautious_weights(model.A, Q, spread, uncertainty_discount, horizon)
         problem = condense(model.A, input_map(model, feet), Q, R, horizon)
         return qp.prepare(problem.H, swinging), problem.F, problem.G
@@ -130,7 +129,9 @@ def build_tables(
         spread=spread,
         state_weights=Q,
         input_weights=R,
-        uncertainty_discount=jnp.asarray(uncertainty_discount, float),
+        uncertainty_discount=jnp.asarray(
+            0.0 if uncertainty_discount is None else uncertainty_discount, float
+        ),
     )
 
 
@@ -175,6 +176,8 @@ def solve_lmpc(
 ) -> LmpcSolution:
     """Force plan of one tick.
 
+    Eight arguments: two of them, ``model`` and ``rows``, replace or add to the tables.
+
     Args:
       tables: of all problems.
       problem: index; traced.
@@ -189,28 +192,12 @@ def solve_lmpc(
     if model is None:
         hessian, index, F, G = tables.hessian, problem, tables.F[problem], tables.G[problem]
     else:
-        Q, R = tables.state_weights[problem], tables.input_weights[problem]
-        if spec.discounts_uncertainty:
-            Q = cautious_weights(
-                model.A, Q, tables.spread[problem], tables.uncertainty_discount, spec.horizon
-            )
-        condensed = condense(model.A, model.B, Q, R, spec.horizon)
+        condensed = _condensed(tables, problem, spec, model)
         hessian, index = qp.prepare(condensed.H, lower == upper), None
         F, G = condensed.F, condensed.G
     q = F @ z - G @ reference.reshape(-1) + tables.q_input[problem]
 
-    warm: qp.Warm | Array | None = memory.warm
-    if memory.warm is not None:
-        # Another problem is another Hessian: its own cold start then.
-        cold = (tables.hessian.table[problem], tables.hessian.side[problem])
-        table, side = jax.tree.map(
-            lambda old, new: jnp.where(problem == memory.problem, old, new),
-            (memory.warm.table, memory.warm.side),
-            cold,
-        )
-        warm = qp.Warm(x=memory.warm.x, table=table, side=side)
-    elif spec.solver != "tableau":
-        warm = shift_plan(memory.plan, spec)
+    warm = _warm_start(tables, problem, memory, spec)
     options: dict[str, Any] = {
         "index": index,
         "tolerance": spec.tolerance,
@@ -235,6 +222,34 @@ def solve_lmpc(
         )
     kept = None if memory.warm is None else solution.warm
     return LmpcSolution(solution.x, solution.status, solution.residual, solution.iterations, kept)
+
+
+def _condensed(
+    tables: LmpcTables, problem: Array, spec: ControllerSpec, model: LinearModel
+) -> CondensedQp:
+    """The problem's weights on another model than the tables' own."""
+    Q, R = tables.state_weights[problem], tables.input_weights[problem]
+    if spec.discounts_uncertainty:
+        Q = cautious_weights(
+            model.A, Q, tables.spread[problem], tables.uncertainty_discount, spec.horizon
+        )
+    return condense(model.A, model.B, Q, R, spec.horizon)
+
+
+def _warm_start(
+    tables: LmpcTables, problem: Array, memory: LmpcMemory, spec: ControllerSpec
+) -> qp.Warm | Array | None:
+    """Where the box QP goes on from: the last tick's tableau, or for other solvers its plan."""
+    if memory.warm is None:
+        return None if spec.solver == "tableau" else shift_plan(memory.plan, spec)
+    # Another problem is another Hessian: its own cold start then.
+    cold = (tables.hessian.table[problem], tables.hessian.side[problem])
+    table, side = jax.tree.map(
+        lambda old, new: jnp.where(problem == memory.problem, old, new),
+        (memory.warm.table, memory.warm.side),
+        cold,
+    )
+    return qp.Warm(x=memory.warm.x, table=table, side=side)
 
 
 def shift_plan(plan: Float[Array, "nu"], spec: ControllerSpec) -> Float[Array, "nu"]:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kjax import gait, qp
 from kjax.legs.kinematics import LegTrig, foot_jacobian, inverse
+from kjax.spec import CycleSpec
 from kjax.types import GRAVITY, MODE_ALPHA, RobotParams
 
 
@@ -164,21 +165,48 @@ class HorizonForecast(NamedTuple):
     force_z: Float[Array, "K"]
 
 
+class HorizonCommand(NamedTuple):
+    """What the horizon is to follow.
+
+    Attributes:
+      position: reference of p_x now [m].
+      velocity: reference of v_x now [m/s].
+      target: velocity that the reference is on its way to [m/s].
+      slew: at this rate [m/s^2].
+      height: of the centre of mass, mean of the stances, above z = 0 [m].
+      periodic: (K, 4) the gait's periodic motion (z, theta, v_z, omega) at the nodes' ends.
+    """
+
+    position: Float[Array, ""]
+    velocity: Float[Array, ""]
+    target: Float[Array, ""]
+    slew: Float[Array, ""]
+    height: Float[Array, ""]
+    periodic: Float[Array, "K 4"]
+
+
+class Stances(NamedTuple):
+    """Where and how long the feet stand.
+
+    Attributes:
+      ground: height of the ground [m].
+      feet: (2, 2) where the front and rear feet are now, world [m].
+      duration: (K,) length of the node's phase [s].
+      cycle: length of the gait cycle [s].
+    """
+
+    ground: Float[Array, ""]
+    feet: Float[Array, "2 2"]
+    duration: Float[Array, "K"]
+    cycle: Float[Array, ""]
+
+
 def predict(
     params: MultiPhaseParams,
     nodes: Nodes,
     x: Float[Array, "6"],
-    *,
-    position: Float[Array, ""],
-    velocity: Float[Array, ""],
-    command: Float[Array, ""],
-    slew: Float[Array, ""],
-    height: Float[Array, ""],
-    ground: Float[Array, ""],
-    periodic: Float[Array, "K 4"],
-    contact: Float[Array, "2 2"],
-    stance_time: Float[Array, "K"],
-    cycle_time: Float[Array, ""],
+    command: HorizonCommand,
+    stances: Stances,
 ) -> HorizonForecast:
     """Reference, path of the centre of mass and footholds over the horizon.
 
@@ -186,20 +214,13 @@ def predict(
       params: feet, gains and time constants.
       nodes: of the horizon.
       x: state now.
-      position: reference of p_x now [m].
-      velocity: reference of v_x now [m/s].
-      command: velocity that the reference is on its way to [m/s].
-      slew: at this rate [m/s^2].
-      height: of the centre of mass, mean of the stances, above z = 0 [m].
-      ground: height of the ground [m].
-      periodic: (K, 4) the gait's periodic motion at the nodes' ends.
-      contact: (2, 2) where the front and rear feet are now, world [m].
-      stance_time: (K,) length of the node's phase [s].
-      cycle_time: length of the gait cycle [s].
+      command: that the reference follows.
+      stances: of the feet.
     """
-    missing = command - velocity
+    velocity, height = command.velocity, command.height
+    missing = command.target - velocity
     # s, until it is there; no shorter than what leaves derivatives by it finite.
-    ramp = jnp.maximum(jnp.abs(missing) / slew, 1e-6)
+    ramp = jnp.maximum(jnp.abs(missing) / command.slew, 1e-6)
 
     def speed(t: Array) -> Array:
         return velocity + missing * jnp.minimum(t / ramp, 1.0)
@@ -208,9 +229,17 @@ def predict(
         within = jnp.minimum(t, ramp)
         return velocity * t + missing * (0.5 * within * (within / ramp) + t - within)
 
-    z, theta, v_z, omega = periodic.T
+    z, theta, v_z, omega = command.periodic.T
     reference = jnp.stack(
-        [position + travel(nodes.end), height + z, theta, speed(nodes.end), v_z, omega], axis=-1
+        [
+            command.position + travel(nodes.end),
+            height + z,
+            theta,
+            speed(nodes.end),
+            v_z,
+            omega,
+        ],
+        axis=-1,
     )
     lead, tau = x[3] - velocity, params.velocity_time
 
@@ -230,17 +259,17 @@ def predict(
     error = lead * jnp.exp(-nodes.begin / tau)
     ahead = (
         params.feet[nodes.end_index]
-        + 0.5 * stance_time * (speed(nodes.begin) + error)
+        + 0.5 * stances.duration * (speed(nodes.begin) + error)
         + params.velocity_gain * error
     )
-    coming = jnp.stack(
-        [forward(nodes.begin) + ahead, jnp.broadcast_to(ground, ahead.shape)], axis=-1
+    next_foothold = jnp.stack(
+        [forward(nodes.begin) + ahead, jnp.broadcast_to(stances.ground, ahead.shape)], axis=-1
     )
-    foot = jnp.where(nodes.present[:, None], contact[nodes.end_index], coming)
+    foot = jnp.where(nodes.present[:, None], stances.feet[nodes.end_index], next_foothold)
     # Vertical impulses that carry the weight over a cycle and leave no net turn.
     lever = jnp.abs(params.feet)
     share = (lever[::-1] / lever.sum())[nodes.end_index]
-    load = share * params.mass * GRAVITY * cycle_time / stance_time
+    load = share * params.mass * GRAVITY * stances.cycle / stances.duration
     standing = nodes.feet > 0
     force_z = jnp.where(standing, load / jnp.maximum(nodes.feet, 1.0), 0.0)
     return HorizonForecast(reference=reference, path=path, foot=foot, force_z=force_z)
@@ -271,9 +300,7 @@ def solve(
     forecast: HorizonForecast,
     x: Float[Array, "6"],
     lever: Float[Array, "2"],
-    *,
-    tolerance: float,
-    max_iterations: int,
+    spec: CycleSpec,
 ) -> MultiPhasePlan:
     """Forces over the horizon.
 
@@ -284,8 +311,7 @@ def solve(
       forecast: from ``predict``.
       x: state now.
       lever: (2,) centre of mass in the trunk frame [m].
-      tolerance: of the QP.
-      max_iterations: of the QP.
+      spec: tolerance and limit of the QP.
     """
     K = nodes.length.shape[0]
     free, forced = response(params, nodes, forecast, x)
@@ -315,8 +341,8 @@ def solve(
         lower,
         upper,
         method="active_set",
-        tolerance=tolerance,
-        max_iterations=max_iterations,
+        tolerance=spec.tolerance,
+        max_iterations=spec.max_iterations,
     )
     return MultiPhasePlan(
         force=solution.x.reshape(K, 2),

@@ -14,6 +14,7 @@ from kjax.controllers.resolve import multiphase_params
 from kjax.controllers.walkable import build_gaits, cycle_nodes
 from kjax.mpc import multiphase
 from kjax.robots import go1
+from kjax.spec import CycleSpec
 from kjax.types import GRAVITY, Leg
 
 COUNT = 15
@@ -79,16 +80,20 @@ def forecast_of(params):
             params,
             nodes,
             x,
-            position=x[0],
-            velocity=jnp.asarray(velocity),
-            command=jnp.asarray(command),
-            slew=jnp.asarray(slew),
-            height=jnp.asarray(0.27),
-            ground=jnp.asarray(0.0),
-            periodic=jnp.zeros((COUNT, 4)),
-            contact=jnp.asarray(contact),
-            stance_time=jnp.asarray(DURATION)[nodes.phase],
-            cycle_time=jnp.asarray(0.35),
+            multiphase.HorizonCommand(
+                position=x[0],
+                velocity=jnp.asarray(velocity),
+                target=jnp.asarray(command),
+                slew=jnp.asarray(slew),
+                height=jnp.asarray(0.27),
+                periodic=jnp.zeros((COUNT, 4)),
+            ),
+            multiphase.Stances(
+                ground=jnp.asarray(0.0),
+                feet=jnp.asarray(contact),
+                duration=jnp.asarray(DURATION)[nodes.phase],
+                cycle=jnp.asarray(0.35),
+            ),
         )
 
     return build
@@ -239,11 +244,11 @@ def plan(params, schedule, forecast_of):
     forecast = forecast_of(nodes, x, velocity=0.3, command=1.0)
     lever = jnp.array([0.0, -0.018])
 
+    spec = CycleSpec(nodes=COUNT - 1, tolerance=1e-9, max_iterations=40)
+
     @jax.jit
     def solve(params):
-        return multiphase.solve(
-            params, go1.PARAMS, nodes, forecast, x, lever, tolerance=1e-9, max_iterations=40
-        )
+        return multiphase.solve(params, go1.PARAMS, nodes, forecast, x, lever, spec)
 
     rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, forecast, lever)
     return solve, nodes, forecast, rows, limit
