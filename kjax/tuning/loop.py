@@ -10,20 +10,21 @@ beginnings of some sqrt(T) segments and walks each segment again.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from math import ceil, exp, inf, sqrt
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from kjax import gait
 from kjax.config import NoiseConfig, RunConfig
 from kjax.config.gaits import gait_setting
 from kjax.config.units import in_si
-from kjax.controllers.controller import build_controller
-from kjax.controllers.params import ControllerParams, condense
+from kjax.controllers.controller import Controller, build_controller
+from kjax.controllers.params import ControllerParams, Tables, condense
 from kjax.controllers.reference import next_clock
 from kjax.controllers.resolve import controller_spec
 from kjax.controllers.rigid_body import body_numbers
@@ -124,61 +125,21 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
     if not memory > 0:
         raise ValueError(f"memory must be above 0 s, got {memory}")
     segments = -(-ticks // segment)
-    keep = exp(-dt / memory)
-
-    def fade(x: Array) -> Array:
-        return x if keep == 1.0 else keep * x + (1.0 - keep) * jax.lax.stop_gradient(x)
+    step = _build_tick(controller, dt, memory)
 
     def run(params: ControllerParams, scenario: Scenario) -> Trace:
         params = params._replace(command=scenario.command)
         tables = condense(spec, params)
-        robot, plant = params.robot, scenario.plant
-        key = jax.random.wrap_key_data(scenario.key)
-
-        def tick(carry: _Carry, number: Array) -> tuple[_Carry, Trace]:
-            x, state = carry.x, carry.state
-            error = scenario.noise * jax.random.normal(
-                jax.random.fold_in(key, number), (STATE_DIM,), x.dtype
-            )
-            feet = _touch_down(params, state, plant, carry, x.at[2:].add(error[2:]), dt)
-            measured = x.at[2:].add(error[2:])
-            seen = body_plant.local_view(robot, plant.com, measured, feet)
-            always = jnp.ones((), bool)
-            state, info = controller.plan_from(tables, state, seen, state.stance, always)
-            true = body_plant.view(robot, plant.com, x, feet).planar
-            feet, rates, state = _swing(params, state, true, feet, dt)
-            spin = body_plant.leg_momentum(robot, plant, true, feet, rates)
-            # What the legs gain the trunk loses; at the first tick they are as they are.
-            turns = (number > 0) & carry.alive
-            x = x.at[5].add(jnp.where(turns, carry.spin - spin, 0.0) / plant.inertia)
-            before = carry.force * state.stance[:, None]
-            planned = state.force[:, ::2] @ seen.planar.rotation
-            pressed, reached = body_plant.follow(plant, before, planned, dt)
-            force = body_plant.feasible(robot, plant, true, pressed)
-            sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
-            moved = body_plant.advance(plant, state.stance, x, feet - sole, force, dt)
-            alive = carry.alive & _upright(moved)
-            record = Trace(
-                x=x,
-                wanted=jnp.stack([state.velocity, params.height[state.clock.gait] + state.height]),
-                feet=feet,
-                stance=state.stance,
-                mode=info.mode,
-                force=force,
-                missing=pressed - force,
-                status=info.status,
-                alive=carry.alive,
-            )
-            now = fade(jnp.where(alive, moved, x))
-            return _Carry(now, feet, state, reached, spin, alive), record
+        plant = scenario.plant
+        own = _Run(params, tables, scenario, jax.random.wrap_key_data(scenario.key))
 
         def stretch(carry: _Carry, numbers: Array) -> tuple[_Carry, Trace]:
-            return jax.lax.scan(tick, carry, numbers)
+            return jax.lax.scan(partial(step, own), carry, numbers)
 
         numbers = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
         feet = _standing(params, plant, scenario.x)
         state = controller.init_from(
-            tables, body_plant.local_view(robot, plant.com, scenario.x, feet)
+            tables, body_plant.local_view(params.robot, plant.com, scenario.x, feet)
         )
         none = jnp.zeros_like(feet)
         first = _Carry(scenario.x, feet, state, none, none[0, 0], jnp.ones((), bool))
@@ -186,6 +147,72 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], trace)
 
     return run
+
+
+class _Run(NamedTuple):
+    """What stays the same over a run."""
+
+    params: ControllerParams
+    tables: Tables
+    scenario: Scenario
+    key: PRNGKeyArray
+
+
+def _build_tick(
+    controller: Controller, dt: float, memory: float
+) -> Callable[[_Run, _Carry, Array], tuple[_Carry, Trace]]:
+    """A control tick: measure, plan, swing, press, and one step of the body.
+
+    Args:
+      controller: whose ``plan`` it is.
+      dt: length of a tick [s].
+      memory: see ``build_loop`` [s].
+    """
+    keep = exp(-dt / memory)
+
+    def fade(x: Array) -> Array:
+        return x if keep == 1.0 else keep * x + (1.0 - keep) * jax.lax.stop_gradient(x)
+
+    def tick(run: _Run, carry: _Carry, number: Array) -> tuple[_Carry, Trace]:
+        params, tables, scenario, key = run
+        robot, plant = params.robot, scenario.plant
+        x, state = carry.x, carry.state
+        error = scenario.noise * jax.random.normal(
+            jax.random.fold_in(key, number), (STATE_DIM,), x.dtype
+        )
+        feet = _touch_down(params, state, plant, carry, x.at[2:].add(error[2:]), dt)
+        measured = x.at[2:].add(error[2:])
+        seen = body_plant.local_view(robot, plant.com, measured, feet)
+        always = jnp.ones((), bool)
+        state, info = controller.plan_from(tables, state, seen, state.stance, always)
+        true = body_plant.view(robot, plant.com, x, feet).planar
+        feet, rates, state = _swing(params, state, true, feet, dt)
+        spin = body_plant.leg_momentum(robot, plant, true, feet, rates)
+        # What the legs gain the trunk loses; at the first tick they are as they are.
+        turns = (number > 0) & carry.alive
+        x = x.at[5].add(jnp.where(turns, carry.spin - spin, 0.0) / plant.inertia)
+        before = carry.force * state.stance[:, None]
+        planned = state.force[:, ::2] @ seen.planar.rotation
+        pressed, reached = body_plant.follow(plant, before, planned, dt)
+        force = body_plant.feasible(robot, plant, true, pressed)
+        sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+        next_x = body_plant.advance(plant, state.stance, x, feet - sole, force, dt)
+        alive = carry.alive & _upright(next_x)
+        record = Trace(
+            x=x,
+            wanted=jnp.stack([state.velocity, params.height[state.clock.gait] + state.height]),
+            feet=feet,
+            stance=state.stance,
+            mode=info.mode,
+            force=force,
+            missing=pressed - force,
+            status=info.status,
+            alive=carry.alive,
+        )
+        now = fade(jnp.where(alive, next_x, x))
+        return _Carry(now, feet, state, reached, spin, alive), record
+
+    return tick
 
 
 def _upright(x: Array) -> Array:
@@ -310,6 +337,8 @@ def draw_scenarios(
     robot: RobotParams | None = None,
 ) -> Scenario:
     """Random scenarios (count, ...): commands, starts, masses, inertias, noise.
+
+    Ten arguments: what is drawn, and its ranges by keyword.
 
     Args:
       config: duration, height, rigid body, size of the noise.

@@ -95,6 +95,8 @@ def descend(
 ) -> Descent:
     """Adam on the mean cost of ``train``; the best point on ``held_out`` is returned.
 
+    Fourteen arguments: four that it is about, and an optimiser's options by keyword.
+
     Args:
       objective: of variables and a scenario.
       space: of the variables; each update is brought back into their ranges.
@@ -114,23 +116,63 @@ def descend(
     Raises:
       ValueError: for a checkpoint of another tuning, or unusable numbers.
     """
-    import optax
-
     for name, count in (("updates", updates), ("every", every), ("patience", patience)):
         if count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")
     if not rate > 0:
         raise ValueError(f"rate must be above 0, got {rate}")
-    schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.1)
-    optimiser = optax.adam(schedule)
-
-    @jax.jit
-    def slopes(variables: Variables) -> tuple[Array, Variables]:
-        return jax.vmap(jax.value_and_grad(objective), (None, 0))(variables, train)
+    begin, slopes, move = _build_update(objective, space, train, updates, rate, clip)
 
     @jax.jit
     def look(variables: Variables) -> Array:
         return jax.vmap(objective, (None, 0))(variables, held_out).mean()
+
+    variables = space.start if start is None else start
+    limits = _Limits(updates, patience, seconds)
+    run = _Run(variables, begin(variables), variables)
+    if checkpoint is not None and checkpoint.exists():
+        run = _load(checkpoint, identity, run)
+        if run.stopped == "time":  # there may be more of it now
+            run.stopped = _reason(run, run.checks[-1], limits)
+    clock = time.perf_counter() - run.seconds
+    while not run.stopped:
+        number = len(run.cost)
+        if number % every == 0 and (not run.checks or run.checks[-1] < number):
+            run.judge(number, float(look(run.variables)))
+            run.seconds = time.perf_counter() - clock
+            run.stopped = _reason(run, number, limits)
+            if checkpoint is not None:
+                _save(checkpoint, identity, run)
+            if run.stopped:
+                break
+        costs, slope = slopes(run.variables)
+        fault = _fault(costs, slope)
+        if fault:
+            run.stopped = f"update {number}: {fault}"
+            break
+        run.variables, run.state = move(run.variables, run.state, slope)
+        run.cost.append(float(costs.mean()))
+        if on_update is not None:
+            on_update(len(run.cost), run.cost[-1], run.best_cost)
+    return run.descent()
+
+
+def _build_update(
+    objective: Objective,
+    space: Space,
+    train: Scenario,
+    updates: int,
+    rate: float,
+    clip: float,
+) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    """State of Adam at variables; costs and slopes of all scenarios; variables and state after."""
+    import optax
+
+    optimiser = optax.adam(optax.cosine_decay_schedule(rate, updates, alpha=0.1))
+
+    @jax.jit
+    def slopes(variables: Variables) -> tuple[Array, Variables]:
+        return jax.vmap(jax.value_and_grad(objective), (None, 0))(variables, train)
 
     @jax.jit
     def move(variables: Variables, state: Any, slope: Variables) -> tuple[Variables, Any]:
@@ -144,49 +186,15 @@ def descend(
         change, state = optimiser.update(mean, state, variables)
         return space.inside(optax.apply_updates(variables, change)), state
 
-    variables = space.start if start is None else start
-    run = _Run(variables, optimiser.init(variables), variables)
-    if checkpoint is not None and checkpoint.exists():
-        run = _load(checkpoint, identity, run)
-        if run.stopped == "time":  # there may be more of it now
-            run.stopped = _reason(run, run.checks[-1], updates, patience, seconds)
-    clock = time.perf_counter() - run.seconds
-    stopped = run.stopped
-    while not stopped:
-        number = len(run.cost)
-        if number % every == 0 and (not run.checks or run.checks[-1] < number):
-            value = float(look(run.variables))
-            run.checks.append(number)
-            run.held_out.append(value)
-            if value < run.best_cost:
-                run.best, run.best_cost, run.best_update = run.variables, value, number
-            run.seconds = time.perf_counter() - clock
-            stopped = _reason(run, number, updates, patience, seconds)
-            run.stopped = stopped
-            if checkpoint is not None:
-                _save(checkpoint, identity, run)
-            if stopped:
-                break
-        costs, slope = slopes(run.variables)
-        fault = _fault(costs, slope)
-        if fault:
-            stopped = run.stopped = f"update {number}: {fault}"
-            break
-        run.variables, run.state = move(run.variables, run.state, slope)
-        run.cost.append(float(costs.mean()))
-        if on_update is not None:
-            on_update(len(run.cost), run.cost[-1], run.best_cost)
-    return Descent(
-        best=run.best,
-        best_cost=run.best_cost,
-        best_update=run.best_update,
-        cost=np.array(run.cost),
-        checks=np.array(run.checks),
-        held_out=np.array(run.held_out),
-        seconds=run.seconds,
-        stopped=stopped,
-        healthy=stopped in ("updates", "patience", "time"),
-    )
+    return optimiser.init, slopes, move
+
+
+class _Limits(NamedTuple):
+    """When a descent ends: updates, updates without a better look, wall time [s]."""
+
+    updates: int
+    patience: int
+    seconds: float
 
 
 class _Run:
@@ -205,18 +213,39 @@ class _Run:
     def arrays(self) -> Any:
         return self.variables, self.state, self.best
 
+    def judge(self, number: int, value: float) -> None:
+        """Take down the held-out cost before an update; keep the variables if it is the least."""
+        self.checks.append(number)
+        self.held_out.append(value)
+        if value < self.best_cost:
+            self.best, self.best_cost, self.best_update = self.variables, value, number
+
+    def descent(self) -> Descent:
+        """How it went."""
+        return Descent(
+            best=self.best,
+            best_cost=self.best_cost,
+            best_update=self.best_update,
+            cost=np.array(self.cost),
+            checks=np.array(self.checks),
+            held_out=np.array(self.held_out),
+            seconds=self.seconds,
+            stopped=self.stopped,
+            healthy=self.stopped in ("updates", "patience", "time"),
+        )
+
 
 _PLAIN = ("best_cost", "best_update", "cost", "checks", "held_out", "seconds", "stopped")
 
 
-def _reason(run: _Run, number: int, updates: int, patience: int, seconds: float) -> str:
+def _reason(run: _Run, number: int, limits: _Limits) -> str:
     if not np.isfinite(run.held_out[-1]):
         return f"update {number}: the cost of the held-out scenarios is not finite"
-    if number >= updates:
+    if number >= limits.updates:
         return "updates"
-    if number - run.best_update >= patience:
+    if number - run.best_update >= limits.patience:
         return "patience"
-    return "time" if run.seconds >= seconds else ""
+    return "time" if run.seconds >= limits.seconds else ""
 
 
 def _fault(costs: Array, slope: Variables) -> str:

@@ -64,6 +64,8 @@ def nominal_plant(
 ) -> PlantParams:
     """The plant of a robot that stands: its centre of mass is that of the whole body.
 
+    Eight arguments: those of ``PlantParams``, with defaults.
+
     Args:
       robot: geometry and masses of the links.
       mass: of the body [kg].

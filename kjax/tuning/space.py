@@ -72,16 +72,7 @@ def build_space(
     """
     robot = get_robot(config.robot).params if robot is None else robot
     kinds = tunable(RunConfig, config.gaits)
-    if not keys:
-        raise ValueError("keys must name at least one variable, got none")
-    for key in keys:
-        if key not in kinds:
-            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
-        if key.startswith("srb.") and not get_kind(config.koopman.model).is_body:
-            raise ValueError(
-                f"keys: '{key}' is a variable of models that are the rigid body ('srb', 'planted', "
-                f"'exact') only; got '{config.koopman.model}', which is fitted to data"
-            )
+    _check_keys(config, keys, kinds)
     mass, inertia = (float(number) for number in body_numbers(config, robot))
     config = replace(config, srb=replace(config.srb, mass=mass, inertia=inertia))
     if fits is None:
@@ -103,35 +94,61 @@ def build_space(
 
     def params(variables: Variables) -> ControllerParams:
         values_by_key = values(variables)
-        own = fits
-        if own.prediction is not None and isinstance(own.prediction.params, BodyModel):
-            body = own.prediction.params.body
-            body = body._replace(
-                **{
-                    key.removeprefix("srb."): jnp.broadcast_to(number, body.mass.shape)
-                    for key, number in values_by_key.items()
-                    if key.startswith("srb.")
-                }
-            )
-            model = own.prediction.params._replace(body=body)
-            own = own._replace(prediction=own.prediction._replace(params=model))
-        return cast(gather(Overlay(config, values_by_key), robot, own), dtype)
+        return cast(
+            gather(Overlay(config, values_by_key), robot, _with_body(fits, values_by_key)), dtype
+        )
 
     def overrides(variables: Variables) -> dict[str, Any]:
         return {key: np.asarray(one, float).tolist() for key, one in values(variables).items()}
 
-    start = {}
-    for key in keys:
-        held: Any = config
-        for part in key.split("."):
-            held = held[part] if isinstance(held, Gaits) else getattr(held, part)
-        if held is None:
-            raise ValueError(f"{key} is not given by the config: it has no value to start from")
-        number = np.asarray(held, float)
-        if kinds[key].unit is None and not (number > 0).all():
-            raise ValueError(f"{key} must be positive to be tuned, got {number.tolist()}")
-        start[key] = jnp.asarray(_forward(kinds[key], number), dtype)
+    start = {
+        key: jnp.asarray(_forward(kinds[key], _value_of(config, key, kinds[key])), dtype)
+        for key in keys
+    }
     return Space({key: kinds[key] for key in keys}, start, values, inside, params, overrides)
+
+
+def _check_keys(config: RunConfig, keys: Sequence[str], kinds: Mapping[str, Tunable]) -> None:
+    """Raise a ValueError for keys that are no variables of this config."""
+    if not keys:
+        raise ValueError("keys must name at least one variable, got none")
+    for key in keys:
+        if key not in kinds:
+            raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
+        if key.startswith("srb.") and not get_kind(config.koopman.model).is_body:
+            raise ValueError(
+                f"keys: '{key}' is a variable of models that are the rigid body ('srb', 'planted', "
+                f"'exact') only; got '{config.koopman.model}', which is fitted to data"
+            )
+
+
+def _value_of(config: RunConfig, key: str, kind: Tunable) -> np.ndarray:
+    """What the config holds at a key, to start from."""
+    held: Any = config
+    for part in key.split("."):
+        held = held[part] if isinstance(held, Gaits) else getattr(held, part)
+    if held is None:
+        raise ValueError(f"{key} is not given by the config: it has no value to start from")
+    number = np.asarray(held, float)
+    if kind.unit is None and not (number > 0).all():
+        raise ValueError(f"{key} must be positive to be tuned, got {number.tolist()}")
+    return number
+
+
+def _with_body(fits: Fits, values_by_key: Mapping[str, Array]) -> Fits:
+    """The fits with the tuned mass and inertia, where the model is the rigid body itself."""
+    if fits.prediction is None or not isinstance(fits.prediction.params, BodyModel):
+        return fits
+    body = fits.prediction.params.body
+    body = body._replace(
+        **{
+            key.removeprefix("srb."): jnp.broadcast_to(number, body.mass.shape)
+            for key, number in values_by_key.items()
+            if key.startswith("srb.")
+        }
+    )
+    model = fits.prediction.params._replace(body=body)
+    return fits._replace(prediction=fits.prediction._replace(params=model))
 
 
 def tuned_config(config: RunConfig, overrides: Mapping[str, Any]) -> RunConfig:
