@@ -49,6 +49,8 @@ def prediction_errors(
 ) -> Float[Array, "states profiles steps 6"]:
     """Open-loop errors of every initial state under every force profile.
 
+    Eleven arguments: the model, the body, and the size of the test set by keyword.
+
     The paper pairs 50 random initial states with 50 random force profiles over 0.05 s. The
     prediction lifts once, at the start, and then runs in the lifted space alone.
 
@@ -166,7 +168,10 @@ def model_errors(
     *,
     frozen: bool = False,
 ) -> Float[Array, "states profiles steps 6"]:
-    """Predicted minus true states of every start under every force profile, open loop."""
+    """Predicted minus true states of every start under every force profile, open loop.
+
+    Eight arguments: a model (family, params), a body (plant, body, alpha), and what they meet.
+    """
 
     def one(x0: Array, u: Array) -> Array:
         predicted = open_loop(family, params, families.Start(x0, body.feet), u, frozen=frozen)

@@ -186,6 +186,8 @@ def train(
 ) -> tuple[LearnedModel, Training]:
     """Train on windows of rollouts; ``vmap`` it over modes and seeds.
 
+    Eleven arguments: the data, and hyperparameters by keyword.
+
     Args:
       key: random key.
       data: rollouts of one mode; a fifth of them is held out, the best model on it is returned.
@@ -205,8 +207,6 @@ def train(
       The model and how it went. Loss and held-out loss are in units of each state's spread of
       changes over a window. What is not finite stops nothing; ``diverged`` says so.
     """
-    import optax
-
     rollouts, steps = data.inputs.shape[:2]
     if window > steps:
         raise ValueError(f"window must be at most the rollouts' {steps} steps, got {window}")
@@ -220,9 +220,9 @@ def train(
     unit = change.std(axis=(0, 1)) + 1e-9
     short = test._replace(states=test.states[:, : window + 1], inputs=test.inputs[:, :window])
 
-    def free(params: LearnedModel) -> Any:
-        """What is trained: layers and head; where the head is linear, no products."""
-        return params.layers, params.head
+    def value_of(model: LearnedModel, windows: Snapshots) -> Array:
+        value = prediction_loss(model, windows, unit)
+        return value if extra_loss is None else value + extra_loss(model)
 
     def loss(parts: Any, key: Array) -> Array:
         layers, maps = parts
@@ -230,27 +230,56 @@ def train(
             maps = maps._replace(B=jnp.zeros_like(maps.B).at[0].set(maps.B[0]))
         maps = maps._replace(B_feet=jnp.zeros_like(maps.B_feet))
         model = params._replace(layers=layers, head=maps)
-        row, place = jax.random.split(key)
-        which = jax.random.randint(row, (batch,), 0, rollouts - held)
-        begin = jax.random.randint(place, (batch,), 0, steps - window + 1)
+        return value_of(model, _draw_windows(key, fit, window, batch))
 
-        def cut(i: Array, at: Array) -> Snapshots:
-            return Snapshots(
-                states=jax.lax.dynamic_slice_in_dim(fit.states[i], at, window + 1),
-                inputs=jax.lax.dynamic_slice_in_dim(fit.inputs[i], at, window),
-                feet=fit.feet[i],
-            )
+    begin, update = _build_update(loss, _units(params, fit), rate, updates)
 
-        value = prediction_loss(model, jax.vmap(cut)(which, begin), unit)
-        return value if extra_loss is None else value + extra_loss(model)
+    def stretch(carry: Any, keys: Array) -> tuple[Any, tuple[Array, Array]]:
+        inner, best, best_value = carry
+        inner, values = jax.lax.scan(update, inner, keys)
+        now = params._replace(layers=inner[0][0], head=inner[0][1])
+        value = value_of(now, short)
+        better = value < best_value  # NaN is never better
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), inner[0], best)
+        return (inner, best, jnp.where(better, value, best_value)), (values, value)
 
-    def judged(model: LearnedModel) -> Array:
-        value = prediction_loss(model, short, unit)
-        return value if extra_loss is None else value + extra_loss(model)
+    checks = max(1, updates // every)
+    keys = jax.random.split(key_loop, (checks, min(every, updates)))
+    first = value_of(params, short)
+    parts = (params.layers, params.head)  # what is trained
+    (_, best, _), (losses, held_out) = jax.lax.scan(
+        stretch, ((parts, begin(parts)), parts, first), keys
+    )
+    model = params._replace(layers=best[0], head=best[1])
+    losses = losses.reshape(-1)
+    return model, Training(losses, held_out, ~jnp.isfinite(losses).all())
+
+
+def _draw_windows(key: Array, data: Snapshots, window: int, batch: int) -> Snapshots:
+    """Windows of random rollouts that begin at random steps."""
+    rollouts, steps = data.inputs.shape[:2]
+    row, place = jax.random.split(key)
+    which = jax.random.randint(row, (batch,), 0, rollouts)
+    begin = jax.random.randint(place, (batch,), 0, steps - window + 1)
+
+    def one(i: Array, first: Array) -> Snapshots:
+        return Snapshots(
+            states=jax.lax.dynamic_slice_in_dim(data.states[i], first, window + 1),
+            inputs=jax.lax.dynamic_slice_in_dim(data.inputs[i], first, window),
+            feet=data.feet[i],
+        )
+
+    return jax.vmap(one)(which, begin)
+
+
+def _build_update(
+    loss: Callable[[Any, Array], Array], units: Any, rate: float, updates: int
+) -> tuple[Callable[[Any], Any], Callable[[Any, Array], tuple[Any, Array]]]:
+    """State of Adam at parameters; and an update of both by a key, in units of each parameter."""
+    import optax
 
     schedule = optax.cosine_decay_schedule(rate, updates, alpha=0.01)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
-    units = _units(params, fit)
 
     def scaled(parts: Any) -> Any:
         return jax.tree.map(jnp.multiply, parts, units)
@@ -261,22 +290,4 @@ def train(
         change, state = optimiser.update(scaled(slope), state)
         return (optax.apply_updates(parts, scaled(change)), state), value
 
-    def stretch(carry: Any, keys: Array) -> tuple[Any, tuple[Array, Array]]:
-        inner, best, best_value = carry
-        inner, values = jax.lax.scan(update, inner, keys)
-        now = params._replace(layers=inner[0][0], head=inner[0][1])
-        value = judged(now)
-        better = value < best_value  # NaN is never better
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), inner[0], best)
-        return (inner, best, jnp.where(better, value, best_value)), (values, value)
-
-    checks = max(1, updates // every)
-    keys = jax.random.split(key_loop, (checks, min(every, updates)))
-    first = judged(params)
-    parts = free(params)
-    (_, best, _), (losses, held_out) = jax.lax.scan(
-        stretch, ((parts, optimiser.init(parts)), parts, first), keys
-    )
-    model = params._replace(layers=best[0], head=best[1])
-    losses = losses.reshape(-1)
-    return model, Training(losses, held_out, ~jnp.isfinite(losses).all())
+    return optimiser.init, update

@@ -138,13 +138,15 @@ def predict(
         count = min(_BLOCK, len(states) - first)
         x, ground = jnp.asarray(data.x[rows, 0]), jnp.asarray(data.ground[rows])
         for i in range(data.u.shape[1]):
-            # The feet at the start are seen, even where they have just come down.
-            new = data.new[rows, i] & (i > 0) & (landing is not None)
-            mode = data.mode[rows, i if landing is not None else 0]
-            phase = jax.tree.map(lambda a, i=i, rows=rows: a[rows, i], data.phase)
-            x, ground = step(
-                *params, x, ground, data.u[rows, i], mode, new, phase, data.level[rows]
+            tick = _Tick(
+                u=data.u[rows, i],
+                mode=data.mode[rows, i if landing is not None else 0],
+                # The feet at the start are seen, even where they have just come down.
+                new=data.new[rows, i] & (i > 0) & (landing is not None),
+                phase=jax.tree.map(lambda a, i=i, rows=rows: a[rows, i], data.phase),
+                level=data.level[rows],
             )
+            x, ground = step(params, x, ground, tick)
             states[first : first + count, i + 1] = np.asarray(x)[:count]
     return states
 
@@ -152,27 +154,30 @@ def predict(
 _BLOCK = 4096  # windows
 
 
+class _Tick(NamedTuple):
+    """One tick of windows; see ``Windows``."""
+
+    u: Any
+    mode: Any
+    new: Any
+    phase: GaitPhase
+    level: Any
+
+
 @lru_cache(maxsize=64)
 def _step(features: Features, dt: float) -> Callable[..., tuple[Array, Array]]:
     """Compiled step of many windows: next states and contact points."""
 
     def step(
-        body: srb_planar.SrbParams,
-        W: Array,
-        landing: Array,
-        x: Array,
-        ground: Array,
-        u: Array,
-        mode: Array,
-        new: Array,
-        phase: GaitPhase,
-        level: Array,
+        params: tuple[srb_planar.SrbParams, Array, Array], x: Array, ground: Array, tick: _Tick
     ) -> tuple[Array, Array]:
+        body, W, landing = params
+        u, mode, new, phase, level = tick
         ground = jnp.where(new, _come_down(landing, mode, x, ground, level), ground)
         gain = W[mode] @ read(features, x, u, ground, mode, phase)
         return planted(body, mode, ground, x, u, dt) + gain, ground
 
-    return jax.jit(jax.vmap(step, in_axes=(None, None, None, *([0] * 7))))
+    return jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0)))
 
 
 def predict_as_lmpc(

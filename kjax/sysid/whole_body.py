@@ -69,6 +69,8 @@ def fit(
 ) -> Fit:
     """Residual weights of each contact mode by least squares.
 
+    Eight arguments: the data, the body, and options by keyword.
+
     With several ``steps`` the residuals and the features are summed over so many ticks in a row:
     W then fits the drift of the prediction rather than each tick, in which what one tick loses to
     the give of a contact and the next one gets back is noise that outweighs it.
