@@ -243,13 +243,13 @@ def _warm_start(
     if memory.warm is None:
         return None if spec.solver == "tableau" else shift_plan(memory.plan, spec)
     # Another problem is another Hessian: its own cold start then.
-    cold = (tables.hessian.table[problem], tables.hessian.side[problem])
-    table, side = jax.tree.map(
+    cold = (tables.hessian.table[problem], tables.hessian.bound_status[problem])
+    table, bound_status = jax.tree.map(
         lambda old, new: jnp.where(problem == memory.problem, old, new),
-        (memory.warm.table, memory.warm.side),
+        (memory.warm.table, memory.warm.bound_status),
         cold,
     )
-    return qp.Warm(x=memory.warm.x, table=table, side=side)
+    return qp.Warm(x=memory.warm.x, table=table, bound_status=bound_status)
 
 
 def shift_plan(plan: Float[Array, "nu"], spec: ControllerSpec) -> Float[Array, "nu"]:

@@ -73,7 +73,7 @@ class _Settings(NamedTuple):
 
 
 class _Sizes(NamedTuple):
-    """What a problem's numbers are measured by, found once.
+    """Sizes that a problem's values are compared with, found once.
 
     Attributes:
       flat: curvature along a normal that is rounding.

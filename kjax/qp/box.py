@@ -94,7 +94,7 @@ class _Found(NamedTuple):
       residual: its residual.
       iterations: spent.
       table: to go on from.
-      side: sides that ``table`` is swept on.
+      bound_status: sides that ``table`` is swept on.
       current: whether these are the sides that ``x`` was found with.
     """
 
@@ -102,7 +102,7 @@ class _Found(NamedTuple):
     residual: Array
     iterations: Array
     table: Array
-    side: Array
+    bound_status: Array
     current: Array
 
 
@@ -131,20 +131,20 @@ def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Solut
     d, H = prepared.scale, prepared.H
     x = solution.x / d
     gradient = H @ x + q * d
-    side = _active_set(solution, current, lower, upper, gradient)
+    bound_status = _active_set(solution, current, lower, upper, gradient)
     table = where_needed(
         ~current,
-        lambda _, H, side: swept(H, side == 0),
+        lambda _, H, bound_status: swept(H, bound_status == 0),
         solution.warm.table,
         jax.lax.stop_gradient(H),
-        side,
+        bound_status,
     )
     push = dq * d + d_H @ x
-    move = jnp.where(side < 0, d_lower, d_upper) / d
-    out = table @ jnp.where(side == 0, -push, move)
+    move = jnp.where(bound_status < 0, d_lower, d_upper) / d
+    out = table @ jnp.where(bound_status == 0, -push, move)
     good = solution.status <= Status.ITERATION_LIMIT
-    dx = jnp.where(good, jnp.where(side == 0, out, move) * d, 0.0)
-    dy = jnp.where(good & (side != 0), -(out + push) / d, 0.0)
+    dx = jnp.where(good, jnp.where(bound_status == 0, out, move) * d, 0.0)
+    dy = jnp.where(good & (bound_status != 0), -(out + push) / d, 0.0)
     still = jax.tree.map(no_tangent, solution)
     return solution, still._replace(x=dx, multipliers=dy)
 
@@ -156,8 +156,8 @@ def _active_set(
     at_lower = (solution.x <= lower) & (gradient > 0)
     at_upper = (solution.x >= upper) & (gradient < 0)
     by_point = jnp.where(at_lower, -1, jnp.where(at_upper, 1, 0))
-    side = jnp.where(current, solution.warm.side, by_point)
-    return jnp.where(lower == upper, jnp.where(gradient < 0, 1, -1), side)
+    bound_status = jnp.where(current, solution.warm.bound_status, by_point)
+    return jnp.where(lower == upper, jnp.where(gradient < 0, 1, -1), bound_status)
 
 
 def _pick(stack: Any, index: Array) -> Any:
@@ -226,7 +226,7 @@ def _solve(
         gap=unusable,
         margin=jnp.where(good, jnp.min(slack) / size, 0.0),
         iterations=found.iterations,
-        warm=Warm(x=x, table=found.table, side=found.side),
+        warm=Warm(x=x, table=found.table, bound_status=found.bound_status),
     )
     return solution, found.current
 
@@ -239,7 +239,7 @@ def _by_descent(
         tolerance=tolerance, max_iterations=settings.max_iterations,
     )  # fmt: skip
     never = jnp.zeros((), bool)
-    return _Found(x, residual, count, prepared.table, prepared.side, current=never)
+    return _Found(x, residual, count, prepared.table, prepared.bound_status, current=never)
 
 
 class _Limits(NamedTuple):
@@ -276,7 +276,7 @@ def _by_pivoting(
     threshold = relative * jnp.minimum(size, widest), relative * size
 
     first = pivot(
-        warm.table, warm.side, q, lower, upper, threshold=threshold, limit=limits.exchanges
+        warm.table, warm.bound_status, q, lower, upper, threshold=threshold, limit=limits.exchanges
     )
     attempt = _try(box, first)
     tried = where_needed(
@@ -286,7 +286,7 @@ def _by_pivoting(
         box,
         first,
         prepared.table,
-        prepared.side,
+        prepared.bound_status,
         threshold,
     )
     return _Found(
@@ -294,7 +294,7 @@ def _by_pivoting(
         residual=tried.residual,
         iterations=tried.iterations,
         table=jnp.where(tried.corrupted, prepared.table, first.table),
-        side=jnp.where(tried.corrupted, prepared.side, first.side),
+        bound_status=jnp.where(tried.corrupted, prepared.bound_status, first.bound_status),
         current=~tried.corrupted,
     )
 
@@ -306,7 +306,7 @@ def _try(box: ScaledBox, done: Pivoted) -> _Tried:
 
 def _polish(box: ScaledBox, tried: _Tried, done: Pivoted) -> _Tried:
     """A Newton step on the free variables, the tableau an inverse near enough."""
-    free = done.side == 0
+    free = done.bound_status == 0
     move = done.table @ jnp.where(free, -(box.H @ tried.x + box.q), 0.0)
     x = jnp.clip(tried.x + jnp.where(free, move, 0.0), box.lower, box.upper)
     residual = box.residual(x)
@@ -321,7 +321,7 @@ def _refactorise(
     box: ScaledBox,
     first: Pivoted,
     table: Array,
-    side: Array,
+    bound_status: Array,
     threshold: tuple[Array, Array],
 ) -> _Tried:
     """Polish; if that does not do, pivot from the cold start, and take the better point.
@@ -340,7 +340,7 @@ def _refactorise(
     # Where nothing is corrupted no exchange is worth it, which saves a batch the waiting.
     own = jnp.where(corrupted, own[0], jnp.inf), jnp.where(corrupted, own[1], jnp.inf)
     left = limits.exchanges - first.exchanges
-    again = pivot(table, side, box.q, box.lower, box.upper, threshold=own, limit=left)
+    again = pivot(table, bound_status, box.q, box.lower, box.upper, threshold=own, limit=left)
     new = _polish(box, _try(box, again), again)
     better = corrupted & ~(old.residual <= new.residual)
     return _Tried(

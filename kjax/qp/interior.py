@@ -38,7 +38,7 @@ class _Point(NamedTuple):
     y: Float[Array, "M"]
 
 
-def descend_central_path(
+def solve_interior_point(
     problem: RowProblem, good: Array, *, tolerance: float, max_iterations: int
 ) -> tuple[Float[Array, "n"], Float[Array, "M"], Int[Array, ""]]:
     """Best point, its multipliers and the iterations spent; nothing is done if not good."""

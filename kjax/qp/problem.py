@@ -50,7 +50,7 @@ class Prepared(NamedTuple):
       scale: (n,) d, with x = d x_hat.
       table: (n, n) tableau that a cold start pivots from, see ``qp.tableau``; H^-1 where no
         variable is known to be fixed [-].
-      side: (n,) -1 where a variable is known to be fixed, else 0.
+      bound_status: (n,) -1 where a variable is known to be fixed, else 0.
       inverse: (n, n) H^-1 [-].
       eig_min: smallest eigenvalue of the scaled Hessian [-].
       eig_max: largest one [-].
@@ -63,7 +63,7 @@ class Prepared(NamedTuple):
     H: Float[Array, "n n"]
     scale: Float[Array, "n"]
     table: Float[Array, "n n"]
-    side: Int[Array, "n"]
+    bound_status: Int[Array, "n"]
     inverse: Float[Array, "n n"]
     eig_min: Float[Array, ""]
     eig_max: Float[Array, ""]
@@ -101,12 +101,12 @@ class Warm(NamedTuple):
     Attributes:
       x: (n,) point.
       table: (n, n) tableau swept on the free variables.
-      side: (n,) -1 at the lower bound, 0 free, 1 at the upper bound.
+      bound_status: (n,) -1 at the lower bound, 0 free, 1 at the upper bound.
     """
 
     x: Float[Array, "n"]
     table: Float[Array, "n n"]
-    side: Int[Array, "n"]
+    bound_status: Int[Array, "n"]
 
 
 class Solution(NamedTuple):
@@ -171,12 +171,12 @@ def prepare(H: Float[Array, "n n"], fixed: Bool[Array, "n"] | None = None) -> Pr
     eigenvalues, vectors = jnp.linalg.eigh(constant)
     eigenvalues = jnp.maximum(eigenvalues, n * eps * eigenvalues[-1])
     rho = jnp.sqrt(eigenvalues[0] * eigenvalues[-1])
-    side = jnp.zeros((n,), jnp.int32) if fixed is None else -fixed.astype(jnp.int32)
+    bound_status = jnp.zeros((n,), jnp.int32) if fixed is None else -fixed.astype(jnp.int32)
     return Prepared(
         H=scaled,
         scale=scale,
-        table=swept(stand_in, side == 0),
-        side=side,
+        table=swept(stand_in, bound_status == 0),
+        bound_status=bound_status,
         inverse=(vectors / eigenvalues) @ vectors.T,
         eig_min=eigenvalues[0],
         eig_max=eigenvalues[-1],
@@ -189,7 +189,9 @@ def prepare(H: Float[Array, "n n"], fixed: Bool[Array, "n"] | None = None) -> Pr
 
 def start(prepared: Prepared) -> Warm:
     """The cold start, as something to carry."""
-    return Warm(x=jnp.zeros_like(prepared.scale), table=prepared.table, side=prepared.side)
+    return Warm(
+        x=jnp.zeros_like(prepared.scale), table=prepared.table, bound_status=prepared.bound_status
+    )
 
 
 def swept(H: Float[Array, "n n"], free: Bool[Array, "n"]) -> Float[Array, "n n"]:

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from kjax.qp.active_set import ActiveSet, farkas, solve_active_set
 from kjax.qp.batching import where_needed
 from kjax.qp.certificates import Verdict, classify, proves_infeasible
-from kjax.qp.interior import descend_central_path
+from kjax.qp.interior import solve_interior_point
 from kjax.qp.polish import polish
 from kjax.qp.row_problem import (
     RowData,
@@ -150,7 +150,7 @@ def proven_by_active_set(
 def by_interior_point(settings: RowSettings, posed: Posed) -> Found:
     """Primal-dual interior point; H may be singular."""
     usable = _semidefinite(posed.problem) | ~posed.good
-    x, y, count = descend_central_path(
+    x, y, count = solve_interior_point(
         posed.problem,
         posed.good & usable,
         tolerance=0.5 * settings.tolerance,

@@ -27,25 +27,25 @@ class Pivoted(NamedTuple):
 
     Attributes:
       table: (n, n) T.
-      side: (n,) -1 at the lower bound, 0 free, 1 at the upper bound.
+      bound_status: (n,) -1 at the lower bound, 0 free, 1 at the upper bound.
       y: (n,) x of the free variables, g - q of the others.
       exchanges: number made.
     """
 
     table: Float[Array, "n n"]
-    side: Int[Array, "n"]
+    bound_status: Int[Array, "n"]
     y: Float[Array, "n"]
     exchanges: Int[Array, ""]
 
     def point(self, lower: Array, upper: Array) -> Array:
         """The point (n,), within its bounds."""
-        at = jnp.where(self.side < 0, lower, upper)
-        return jnp.clip(jnp.where(self.side == 0, self.y, at), lower, upper)
+        at = jnp.where(self.bound_status < 0, lower, upper)
+        return jnp.clip(jnp.where(self.bound_status == 0, self.y, at), lower, upper)
 
 
 def pivot(
     table: Float[Array, "n n"],
-    side: Int[Array, "n"],
+    bound_status: Int[Array, "n"],
     q: Float[Array, "n"],
     lower: Float[Array, "n"],
     upper: Float[Array, "n"],
@@ -56,8 +56,8 @@ def pivot(
     """Exchange variables until none is further off than ``threshold``, or ``limit`` is reached.
 
     Args:
-      table: swept on the variables whose ``side`` is 0.
-      side: guess; a variable must not be at an infinite bound.
+      table: swept on the variables whose ``bound_status`` is 0.
+      bound_status: guess; a variable must not be at an infinite bound.
       q: linear term.
       lower: bounds; equal ones fix their variable.
       upper: bounds.
@@ -65,19 +65,21 @@ def pivot(
       limit: of the exchanges.
     """
     zero = jnp.zeros((), jnp.int32)
-    state = _State(table, side, q, pivot=zero, pending=jnp.ones((), bool), exchanges=zero)
+    state = _State(table, bound_status, q, pivot=zero, pending=jnp.ones((), bool), exchanges=zero)
     tiny = float(jnp.finfo(q.dtype).tiny)
     weights = tuple(1.0 / jnp.maximum(part, tiny) for part in threshold)
     problem: tuple[Any, ...] = (q, lower, upper, weights, jnp.asarray(limit, jnp.int32))
     state = while_any(lambda state: state.pending, _exchange, _choose(state, *problem), *problem)
-    return Pivoted(table=state.table, side=state.side, y=state.y, exchanges=state.exchanges)
+    return Pivoted(
+        table=state.table, bound_status=state.bound_status, y=state.y, exchanges=state.exchanges
+    )
 
 
 class _State(NamedTuple):
     """``pivot`` is the variable to exchange next, if one is ``pending``."""
 
     table: Array
-    side: Array
+    bound_status: Array
     y: Array
     pivot: Array
     pending: Array
@@ -89,11 +91,11 @@ def _choose(
 ) -> _State:
     """Which variable violates its conditions most."""
     n, dtype = q.shape[0], q.dtype
-    side = state.side
-    free, fixed = side == 0, lower >= upper
-    y = state.table @ jnp.where(free, -q, jnp.where(side < 0, lower, upper))
+    bound_status = state.bound_status
+    free, fixed = bound_status == 0, lower >= upper
+    y = state.table @ jnp.where(free, -q, jnp.where(bound_status < 0, lower, upper))
     violation = jnp.where(
-        free, jnp.maximum(lower - y, y - upper), jnp.sign(side).astype(dtype) * (y + q)
+        free, jnp.maximum(lower - y, y - upper), jnp.sign(bound_status).astype(dtype) * (y + q)
     )
     violation = violation * jnp.where(free, weight[0], weight[1])
     violation = jnp.where(fixed, jnp.where(free, jnp.inf, -jnp.inf), violation)
@@ -109,11 +111,11 @@ def _exchange(
     state: _State, q: Array, lower: Array, upper: Array, weight: Any, limit: Array
 ) -> _State:
     """The state after the exchange of the pivot; the same one if none is pending."""
-    table, side, y, pivot, pending, count = state
+    table, bound_status, y, pivot, pending, count = state
     n, dtype = q.shape[0], q.dtype
     is_pivot = (jnp.arange(n, dtype=jnp.int32) == pivot) & pending
     unit = is_pivot.astype(dtype)
-    sign = jnp.where(side == 0, 1.0, -1.0).astype(dtype)
+    sign = jnp.where(bound_status == 0, 1.0, -1.0).astype(dtype)
     row = (
         unit @ table
     )  # a product, not table[pivot]: XLA would index inside the update's inner loop
@@ -121,7 +123,7 @@ def _exchange(
     column = row * (sign * sign[pivot])
     divisor = jnp.where(pending, 1.0 / jnp.where(pending, row[pivot], 1.0), 0.0)
     table = table - ((column + unit) * divisor)[:, None] * (row - unit)[None, :]
-    new_status = jnp.where((y < lower) | (lower >= upper), -1, 1).astype(side.dtype)
-    side = jnp.where(is_pivot, jnp.where(side == 0, new_status, 0), side)
-    next_state = state._replace(table=table, side=side, exchanges=count + pending)
+    new_status = jnp.where((y < lower) | (lower >= upper), -1, 1).astype(bound_status.dtype)
+    bound_status = jnp.where(is_pivot, jnp.where(bound_status == 0, new_status, 0), bound_status)
+    next_state = state._replace(table=table, bound_status=bound_status, exchanges=count + pending)
     return _choose(next_state, q, lower, upper, weight, limit)

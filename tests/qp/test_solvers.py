@@ -241,7 +241,7 @@ def at(index, value):
     return change
 
 
-# Case -> which of (H, q, lower, upper) is changed, how, and the status it must bring.
+# Name -> which of (H, q, lower, upper) is changed, how, and the status it must bring.
 FAULTS = {
     "NaN in q": ({"q": at(3, np.nan)}, Status.NON_FINITE),
     "infinity in q": ({"q": at(3, -np.inf)}, Status.NON_FINITE),

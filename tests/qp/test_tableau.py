@@ -31,7 +31,7 @@ def chain(seed, ticks, *, condition=1e3, size=N):
 
 
 @partial(jax.jit, static_argnames="tolerance")
-def walk(prepared, q, lower, upper, tolerance=1e-9):
+def solve_chain(prepared, q, lower, upper, tolerance=1e-9):
     """Solutions of all ticks, each from the last one's tableau."""
 
     def tick(warm, q):
@@ -53,7 +53,7 @@ def by_daqp(H, q, lower, upper):
 
 def test_carried_through_two_thousand_ticks_it_stays_exact():
     H, q, lower, upper = chain(0, 2000)
-    solutions = walk(qp.prepare(H), q, lower, upper)
+    solutions = solve_chain(qp.prepare(H), q, lower, upper)
     assert (solutions.status == Status.SOLVED).all()
     np.testing.assert_allclose(solutions.x, by_daqp(H, q, lower, upper), atol=1e-8)
     active = ((solutions.x == lower) | (solutions.x == upper)).sum(axis=1)
@@ -68,7 +68,7 @@ def test_in_float32_drift_is_repaired_before_it_shows():
     narrow = jax.tree.map(
         lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, prepared
     )
-    solutions = walk(narrow, *data[1:], tolerance=1e-5)
+    solutions = solve_chain(narrow, *data[1:], tolerance=1e-5)
     assert solutions.x.dtype == jnp.float32
     assert (solutions.status == Status.SOLVED).mean() > 0.99
     # Nothing is called solved that is not, by a residual in float64.
@@ -88,7 +88,7 @@ def test_a_spoilt_warm_start_costs_time_only(ill):
     elif ill == "another problem's":
         warm = qp.start(qp.prepare(chain(3, 1)[0]))
     else:
-        warm = warm._replace(side=-warm.side + (warm.side == 0))
+        warm = warm._replace(bound_status=-warm.bound_status + (warm.bound_status == 0))
     solution = qp.solve(prepared, q[1], lower, upper, warm)
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, by_daqp(H, q[1:], lower, upper)[0], atol=1e-9)
@@ -207,7 +207,7 @@ def test_forward_and_reverse_mode_agree_through_scan_and_vmap():
 
     def total(q, scale):
         prepared = qp.prepare(scale * H)
-        return (walk(prepared, q, lower, upper).x ** 2).sum()
+        return (solve_chain(prepared, q, lower, upper).x ** 2).sum()
 
     batch = jnp.stack([q, 1.1 * q])
     reverse = jax.vmap(jax.grad(total), (0, None))(batch, 1.3)
