@@ -2,7 +2,7 @@
 
 In a bound or a pronk no constant pose is consistent with the forces: each stance lifts and turns
 the body and each flight lets it fall. The reference is the periodic motion of the rigid body under
-trapezoidal vertical forces whose impulses carry the weight over a cycle and leave no net turn:
+trapezoidal vertical forces whose impulses carry the weight over a cycle and leave no net moment:
 
     J_f + J_r = m g T,   J_f l_f = J_r l_r
 
@@ -69,7 +69,7 @@ def periodic_reference(
     """
     if not has_periodic_reference(modes):
         raise ValueError(f"front and rear must stand, and lift off after each phase, got {modes}")
-    ends = [[i for i, mode in enumerate(modes) if MODE_ALPHA[mode, end] > 0] for end in (0, 1)]
+    stands = [[i for i, mode in enumerate(modes) if MODE_ALPHA[mode, pair] > 0] for pair in (0, 1)]
     total = mass * GRAVITY * float(np.sum(durations))
     impulses = jnp.stack([lever_rear * total, lever_front * total]) / (lever_front + lever_rear)
 
@@ -80,9 +80,9 @@ def periodic_reference(
     shape /= shape.mean()
     force = jnp.zeros((len(modes), cells))
     moment = jnp.zeros_like(force)
-    for end, impulse, lever in zip(ends, impulses, (lever_front, -lever_rear), strict=True):
-        pushed = shape * impulse / sum(durations[i] for i in end)
-        for i in end:
+    for phases, impulse, lever in zip(stands, impulses, (lever_front, -lever_rear), strict=True):
+        pushed = shape * impulse / sum(durations[i] for i in phases)
+        for i in phases:
             force = force.at[i].add(pushed)
             moment = moment.at[i].add(lever * pushed)  # ahead of the body it turns the nose up
     step = np.repeat(np.asarray(durations) / cells, cells)

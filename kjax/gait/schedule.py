@@ -1,4 +1,4 @@
-"""Gaits as arrays, and the phase clock that walks through them.
+"""Gaits as arrays, and the phase clock that runs through them.
 
 A gait is a cycle of phases; each phase says which legs stand, in which contact mode, for how long.
 Gaits are stacked on a leading axis and padded to one number of phases, so that picking or

@@ -1,6 +1,6 @@
 """What a look at samples finds before they are fitted, on the host.
 
-1. Shapes, finite numbers, enough of them.
+1. Shapes, finite values, enough of them.
 2. Observables that are finite on all samples.
 3. The step: displacements against velocities times dt.
 4. Single samples of a velocity that their neighbours and the positions deny.
@@ -22,7 +22,7 @@ from kjax.types import INPUT_DIM, INPUT_NAMES, STATE_DIM, STATE_NAMES, STATE_UNI
 # A displacement is taken to speak of the step where the velocity explains this much of it (r^2);
 # sensor noise alone explains nothing.
 _EXPLAINED = 0.8
-_STEP_OFF = 1.3  # ratio of displacement to velocity times dt from which on the step is refused
+_STEP_ERROR = 1.3  # ratio of displacement to velocity times dt from which on the step is refused
 _SPIKE = 10.0  # times the change of velocity that 90 % of the steps stay under,
 _SPIKE_LEAST = 1.0  # and this much at least [m/s, rad/s]
 _NOISE = 6.0  # times what three quarters of the displacements miss by: positions are noisy too
@@ -45,7 +45,7 @@ def check_snapshots(
       from others, a force far beyond all others.
 
     Raises:
-      ValueError: for wrong shapes, no or too few snapshots, numbers or observables that are not
+      ValueError: for wrong shapes, no or too few snapshots, values or observables that are not
         finite, a ``dt`` or units that displacements and velocities contradict, a single sample that
         its neighbours contradict, and a rollout whose positions do not follow from its velocities,
         as where two episodes were put into one.
@@ -59,7 +59,7 @@ def check_snapshots(
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
         if bad.any():
             raise ValueError(
-                f"{name}: {int(bad.sum())} of {len(bad)} rollouts hold numbers that are not "
+                f"{name}: {int(bad.sum())} of {len(bad)} rollouts hold values that are not "
                 f"finite, the first one is rollout {int(np.argmax(bad))}"
             )
     rows = states.shape[0] * (states.shape[1] - dictionary.window)
@@ -67,17 +67,18 @@ def check_snapshots(
     lifted = np.asarray(lift_all(dictionary, jnp.asarray(states)))
     _check_lifted(lifted, dictionary)
     eps = max(float(np.finfo(a.dtype).eps) for a in (states, lifted) if a.dtype.kind == "f")
-    # The differences of single precision are rounded anew: compare in double.
+    # The differences of single precision are rounded again: compare in double.
     states = states.astype(float)
-    moved = np.diff(states[..., :3], axis=1)
-    mean = 0.5 * (states[:, 1:, 3:] + states[:, :-1, 3:])
-    drift = np.abs(moved - dt * mean).max(axis=2)
+    displacement = np.diff(states[..., :3], axis=1)
+    velocity = 0.5 * (states[:, 1:, 3:] + states[:, :-1, 3:])
+    drift = np.abs(displacement - dt * velocity).max(axis=2)
     # Half a step's change of velocity is the largest difference that a smooth motion has.
     change = np.abs(np.diff(states[..., 3:], axis=1)).max(axis=2)
     noise = _NOISE * float(np.percentile(drift, 75))
     jump = drift > dt * (change + 1.0) + 1e-3 + noise
     few = jump.mean() < 0.5  # else it is rather the step that is wrong
-    _check_step(moved[~jump] if few else moved, dt * (mean[~jump] if few else mean), dt)
+    sound = ~jump if few else np.ones_like(jump)
+    _check_step(displacement[sound], dt * velocity[sound], dt)
     _check_spikes(states, dt)
     if jump.any():
         rollout, step = np.argwhere(jump)[0]
@@ -120,7 +121,7 @@ def require_dataset(dataset: DatasetSpec, columns: int) -> None:
 def _check_shapes(states: np.ndarray, inputs: np.ndarray, feet: np.ndarray) -> None:
     for name, values in (("states", states), ("inputs", inputs), ("feet", feet)):
         if values.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: got values of type {values.dtype}, wanted real numbers")
+            raise ValueError(f"{name}: got values of type {values.dtype}, wanted real values")
     if states.ndim != 3 or states.shape[-1] != STATE_DIM:
         raise ValueError(f"states: got shape {states.shape}, wanted (rollouts, steps + 1, 6)")
     wanted = (states.shape[0], states.shape[1] - 1, INPUT_DIM)
@@ -156,16 +157,16 @@ def _check_step(
     ratio[told] = np.sign(xy[told]) * np.sqrt(yy[told] / xx[told])
     low, high = np.full(3, np.nan), np.full(3, np.nan)
     low[told], high[told] = xy[told] / xx[told], yy[told] / xy[told]
-    off = told & ((low > _STEP_OFF) | (high < 1.0 / _STEP_OFF))
-    if not off.any():
+    wrong = told & ((low > _STEP_ERROR) | (high < 1.0 / _STEP_ERROR))
+    if not wrong.any():
         return
     common = float(np.median(ratio[told]))
-    if off[told].all() and common > 0 and np.allclose(ratio[told], common, rtol=0.2):
+    if wrong[told].all() and common > 0 and np.allclose(ratio[told], common, rtol=0.2):
         raise ValueError(
             f"dt is {dt:g} s, but the states move {common:.3g} times as far as their velocities "
             f"say: their step seems to be {common * dt:.3g} s"
         )
-    i = int(np.argmax(off))
+    i = int(np.argmax(wrong))
     raise ValueError(
         f"states: {STATE_NAMES[i]} moves {ratio[i]:.3g} times as far as {STATE_NAMES[i + 3]} says: "
         "is one of them in other units, or of the other sign?"
@@ -222,12 +223,12 @@ def _remarks(
         )
         yield f"inputs {forced} do not vary in the data: their columns of B stay undetermined"
     size = np.abs(inputs.astype(float))
-    usual = np.percentile(size, 90, axis=(0, 1))
-    for i in np.flatnonzero((usual > 0) & (size.max(axis=(0, 1)) > _OUTLIER * usual)):
+    typical = np.percentile(size, 90, axis=(0, 1))
+    for i in np.flatnonzero((typical > 0) & (size.max(axis=(0, 1)) > _OUTLIER * typical)):
         rollout, step = np.unravel_index(np.argmax(size[..., i]), size.shape[:2])
         yield (
             f"input '{INPUT_NAMES[i]}' is {inputs[rollout, step, i]:.4g} N at step {step} of "
-            f"rollout {rollout}, where 90 % of all lie within {usual[i]:.4g} N"
+            f"rollout {rollout}, where 90 % of all lie within {typical[i]:.4g} N"
         )
     Z = np.concatenate([lifted[:, :-1].reshape(-1, N), forces], axis=1)
     keep = np.flatnonzero(np.concatenate([~still, ~fixed]) | (np.arange(N + INPUT_DIM) == 0))

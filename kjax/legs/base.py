@@ -127,7 +127,7 @@ def build_base(kind: Literal["planar", "free"]) -> Base:
 
 def to_local(view: View, vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Vectors of the heading frame in the axes of the view: the same on the planar base."""
-    return vectors if view.whole is None else spatial.turn(view.whole.heading, vectors)
+    return vectors if view.whole is None else spatial.rotate(view.whole.heading, vectors)
 
 
 def _no_track(observation: Observation) -> None:
@@ -186,7 +186,7 @@ def _planar_joints(
 
 def _free_view(robot: RobotParams, track: Float[Array, "2"], observation: Observation) -> View:
     body = spatial.spatial_state(robot, track, observation)
-    omega = spatial.turn(body.heading, body.omega)
+    omega = spatial.rotate(body.heading, body.omega)
     jacobian = spatial.foot_jacobian(robot, body.hip, body.planar.trig)
     inside = jnp.einsum("lij,lj->li", jacobian, observation.joint_vel)
     turning = jnp.cross(omega, body.feet - body.base)

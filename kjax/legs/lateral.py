@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from kjax.legs.spatial import SpatialState, turn, turn_back
+from kjax.legs.spatial import SpatialState, rotate, rotate_back
 from kjax.types import RobotParams
 
 
@@ -125,9 +125,9 @@ def stance_forces(
       stance: (4,) legs on the ground.
       planned: (4, 3) the LMPC's forces on the robot, track frame [N].
     """
-    forces = turn_back(body.heading, planned)
+    forces = rotate_back(body.heading, planned)
     below = jnp.stack([jnp.zeros_like(body.com[0])] * 2 + [robot.foot_radius])
-    arms = turn_back(body.heading, body.feet - below - body.com)
+    arms = rotate_back(body.heading, body.feet - below - body.com)
     wrench = wrench_map(arms, stance) @ forces.reshape(-1)
     wrench = wrench.at[jnp.array([1, 3, 5])].set(
         jnp.stack(
@@ -138,4 +138,4 @@ def stance_forces(
             ]
         )
     )
-    return turn(body.heading, distribute(params, arms, stance, forces, wrench)) @ body.rotation
+    return rotate(body.heading, distribute(params, arms, stance, forces, wrench)) @ body.rotation

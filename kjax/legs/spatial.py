@@ -163,9 +163,9 @@ def spatial_state(
       track: (2,) cosine and sine of the trunk's yaw at ``init``, world [-].
       observation: of the robot.
     """
-    rotation = turn_back(track, rotation_matrix(observation.base_quat).T).T
-    base = turn_back(track, observation.base_pos)
-    base_vel = turn_back(track, observation.base_vel)
+    rotation = rotate_back(track, rotation_matrix(observation.base_quat).T).T
+    base = rotate_back(track, observation.base_pos)
+    base_vel = rotate_back(track, observation.base_vel)
     forward = _heading(rotation)
     omega = rotation @ observation.base_ang_vel
 
@@ -178,7 +178,7 @@ def spatial_state(
     local = foot_position(robot, hip, trig) + robot.hip_pos
     feet = base + local @ rotation.T
 
-    omega, com_vel = turn_back(forward, omega), turn_back(forward, com_vel)
+    omega, com_vel = rotate_back(forward, omega), rotate_back(forward, com_vel)
     # The nose's horizontal part is never below zero: a pitch of -90 to 90 degrees.
     level = jnp.sqrt(rotation[0, 0] ** 2 + rotation[1, 0] ** 2)
     sine = rotation[2, 0]
@@ -186,7 +186,7 @@ def spatial_state(
 
     def in_plane(points: Array) -> Array:
         """(x, z) in the heading frame about the CoM, with the CoM's progress along the track."""
-        ahead = turn_back(forward, points - com)[..., 0]
+        ahead = rotate_back(forward, points - com)[..., 0]
         return jnp.stack([com[0] + ahead, points[..., 2]], axis=-1)
 
     x = jnp.stack(
@@ -197,7 +197,7 @@ def spatial_state(
             x=x,
             rotation=jnp.stack([jnp.stack([level, -sine]), jnp.stack([sine, level])]),
             base=in_plane(base),
-            base_vel=turn_back(forward, base_vel)[::2],
+            base_vel=rotate_back(forward, base_vel)[::2],
             omega=pitch_rate,
             trig=trig,
             feet=in_plane(feet),
@@ -217,17 +217,17 @@ def spatial_state(
     return jax.lax.optimization_barrier(state)
 
 
-def turn(heading: Float[Array, "2"], vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+def rotate(heading: Float[Array, "2"], vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Vectors of the heading frame in the track frame: Rz(psi) times each of them."""
     c, s = heading
     x, y, z = jnp.moveaxis(vectors, -1, 0)
     return jnp.stack([c * x - s * y, s * x + c * y, z], axis=-1)
 
 
-def turn_back(heading: Float[Array, "2"], vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+def rotate_back(heading: Float[Array, "2"], vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Vectors of the track frame in the heading frame, or of the world in the track frame."""
     c, s = heading
-    return turn(jnp.stack([c, -s]), vectors)
+    return rotate(jnp.stack([c, -s]), vectors)
 
 
 def _heading(rotation: Float[Array, "3 3"]) -> Float[Array, "2"]:

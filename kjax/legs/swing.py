@@ -217,14 +217,14 @@ def spatial_foothold(
       ground: height of the ground [m].
     """
     lever = robot.hip_pos @ body.rotation.T + (body.base - body.com)
-    hips = spatial.turn_back(body.heading, lever)
+    hips = spatial.rotate_back(body.heading, lever)
     across = (
         hips[:, 1]
         + robot.abduction_offset
         + body.com_vel[1] * (remaining + 0.5 * stance_time + gain)
     )
     flat = jnp.stack([along - body.planar.x[0], across, jnp.zeros_like(along)], axis=-1)
-    place = spatial.turn(body.heading, flat) + body.com
+    place = spatial.rotate(body.heading, flat) + body.com
     return place.at[:, 2].set(ground + robot.foot_radius)
 
 
@@ -302,7 +302,7 @@ def spatial_joint_reference(
 ) -> tuple[Float[Array, "4 3"], Float[Array, "4 3"]]:
     """Angles [rad] and rates [rad/s] (4, 3) of all joints for foot references, track frame."""
     lever = position - body.base
-    omega = spatial.turn(body.heading, body.omega)
+    omega = spatial.rotate(body.heading, body.omega)
     drift = velocity - body.base_vel - jnp.cross(omega, lever)
     angle, hip, trig = spatial.inverse(robot, lever @ body.rotation - robot.hip_pos)
     rates = spatial.joint_rates(robot, hip, trig, drift @ body.rotation)

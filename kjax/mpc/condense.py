@@ -74,7 +74,7 @@ def condense(
     return CondensedQp(H=0.5 * (H + H.T), F=G @ A_qp, G=G, A_qp=A_qp, B_qp=B_qp)
 
 
-def cautious_weights(
+def discounted_weights(
     A: Float[Array, "N N"],
     state_weights: Float[Array, "n_x"],
     spread: Float[Array, "n_x"],

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from kjax import qp
 from kjax.koopman.models import LinearModel, aggregate, input_map
-from kjax.mpc.condense import CondensedQp, cautious_weights, condense
+from kjax.mpc.condense import CondensedQp, condense, discounted_weights
 from kjax.mpc.limits import ForceRows
 from kjax.spec import ControllerSpec
 
@@ -32,7 +32,7 @@ class LmpcTables(NamedTuple):
       spread: (M, n_x) standard deviation of their error over one model_dt [m, rad, m/s, rad/s].
       state_weights: (M, n_x) diagonal of Q.
       input_weights: (M, n_u) diagonal of R [1/N^2].
-      uncertainty_discount: see ``condense.cautious_weights`` [-].
+      uncertainty_discount: see ``condense.discounted_weights`` [-].
     """
 
     hessian: qp.Prepared
@@ -100,7 +100,7 @@ def build_tables(
       feet: (M, 2, 2) nominal contact points [m].
       spread: (M, n_x) standard deviation of the one-step error of each model; ``None`` for none.
       uncertainty_discount: by how much uncertain steps weigh less, see
-        ``condense.cautious_weights``; ``None`` for all alike [-].
+        ``condense.discounted_weights``; ``None`` for all alike [-].
     """
     model = jax.vmap(lambda one: aggregate(one, steps))(model)
     Q, R, lower, upper, u_ref = settings
@@ -113,7 +113,7 @@ def build_tables(
         model: LinearModel, Q: Array, R: Array, feet: Array, swinging: Array, spread: Array
     ) -> tuple[qp.Prepared, Array, Array]:
         if uncertainty_discount is not None:
-            Q = cautious_weights(model.A, Q, spread, uncertainty_discount, horizon)
+            Q = discounted_weights(model.A, Q, spread, uncertainty_discount, horizon)
         problem = condense(model.A, input_map(model, feet), Q, R, horizon)
         return qp.prepare(problem.H, swinging), problem.F, problem.G
 
@@ -230,7 +230,7 @@ def _condensed(
     """The problem's weights on another model than the tables' own."""
     Q, R = tables.state_weights[problem], tables.input_weights[problem]
     if spec.discounts_uncertainty:
-        Q = cautious_weights(
+        Q = discounted_weights(
             model.A, Q, tables.spread[problem], tables.uncertainty_discount, spec.horizon
         )
     return condense(model.A, model.B, Q, R, spec.horizon)

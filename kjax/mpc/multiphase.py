@@ -3,7 +3,7 @@
 The model is the SRB with forces in the *world* frame on feet that are fixed in the world. Its
 zero-order-hold step is exactly bilinear in the lifted state (1, p, v, theta, omega): p and v are
 linear in the forces, and only theta and omega carry the products (p_foot - p) x F. With the path
-of p predicted first, the moment arms are numbers and the model is linear and time-varying:
+of p predicted first, the moment arms are known and the model is linear and time-varying:
 
     v_k     = v_0 - g t_k             + sum_{j<=k} h_j alpha_j F_j / m
     omega_k = omega_0                 + sum_{j<=k} h_j alpha_j (r_j x F_j) / I
@@ -27,7 +27,7 @@ from kjax.types import GRAVITY, MODE_ALPHA, RobotParams
 
 
 class MultiPhaseParams(NamedTuple):
-    """Numbers of the multi-phase LMPC; weights are per second of the horizon.
+    """Parameters of the multi-phase LMPC; weights are per second of the horizon.
 
     Those with an axis (G,) are by gait in the controller's parameters; ``for_gait`` picks.
 
@@ -63,7 +63,7 @@ class MultiPhaseParams(NamedTuple):
 
 
 def for_gait(params: MultiPhaseParams, gait: Int[Array, ""]) -> MultiPhaseParams:
-    """Numbers with those that depend on the gait picked for ``gait``, but for ``nodes``."""
+    """Parameters with those that depend on the gait picked for ``gait``, but for ``nodes``."""
     return params._replace(
         state_weights=params.state_weights[gait],
         input_weight=params.input_weight[gait],
@@ -266,7 +266,7 @@ def predict(
         [forward(nodes.begin) + ahead, jnp.broadcast_to(stances.ground, ahead.shape)], axis=-1
     )
     foot = jnp.where(nodes.present[:, None], stances.feet[nodes.end_index], next_foothold)
-    # Vertical impulses that carry the weight over a cycle and leave no net turn.
+    # Vertical impulses that carry the weight over a cycle and leave no net pitch moment.
     lever = jnp.abs(params.feet)
     share = (lever[::-1] / lever.sum())[nodes.end_index]
     load = share * params.mass * GRAVITY * stances.cycle / stances.duration
@@ -319,10 +319,10 @@ def solve(
     B = forced.reshape(6 * K, 2 * K)
     weighted = B * weight.reshape(-1)[:, None]
     R = jnp.repeat(params.input_weight * nodes.length, 2)
-    wish = jnp.stack([jnp.zeros_like(forecast.force_z), forecast.force_z], axis=-1).reshape(-1)
+    u_ref = jnp.stack([jnp.zeros_like(forecast.force_z), forecast.force_z], axis=-1).reshape(-1)
     standing = nodes.feet > 0
     H = 2.0 * (weighted.T @ B + jnp.diag(R))
-    q = 2.0 * (weighted.T @ (free - forecast.reference).reshape(-1) - R * wish)
+    q = 2.0 * (weighted.T @ (free - forecast.reference).reshape(-1) - R * u_ref)
 
     low = jnp.stack([-params.force_x_max, params.force_z[0]])
     high = jnp.stack([params.force_x_max, params.force_z[1]])
@@ -397,8 +397,8 @@ def force_rows(
     theta = forecast.path[:, 2]
     c, s = jnp.cos(theta), jnp.sin(theta)
     to_body = jnp.stack([jnp.stack([c, s], -1), jnp.stack([-s, c], -1)], axis=-2)
-    centre = forecast.foot + jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
-    local = jnp.einsum("kij,kj->ki", to_body, centre - forecast.path[:, :2]) + lever
+    foot_centre = forecast.foot + jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+    local = jnp.einsum("kij,kj->ki", to_body, foot_centre - forecast.path[:, :2]) + lever
     hip = robot.hip_pos[::2, ::2][nodes.end_index]
     trig: LegTrig = jax.lax.optimization_barrier(inverse(robot, local - hip)[2])
     torque = jnp.einsum("kij,kil->kjl", foot_jacobian(robot, trig), to_body)  # J^T R^T

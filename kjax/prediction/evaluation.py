@@ -99,10 +99,10 @@ def force_response_error(
     steps: int,
     duration: float,
 ) -> float:
-    """How wrong a linear model's answer of the velocity to a held force is, at the horizon's end.
+    """Relative error of a linear model's velocity response to a held force, at the horizon's end.
 
     Powers of omega are observables that a linear fit closes badly. Where their coefficients are
-    large the velocity follows from differences of large numbers, which forces upset: prediction of
+    large the velocity follows from differences of large terms, which forces upset: prediction of
     a swinging body may still look right while an LMPC on the model throws the robot over.
 
     Args:
@@ -128,8 +128,8 @@ def force_response_error(
         x, z = np.asarray(body.feet, np.float64)[end]
         wanted[0, 2 * end] = wanted[1, 2 * end + 1] = legs * duration / mass
         # A moment turns the body and with it the vertical force that carries the weight.
-        turn = legs * np.array([-z, x]) / inertia
-        wanted[0, 2 * end : 2 * end + 2] -= GRAVITY * turn * duration**3 / 6
+        pitch_acceleration = legs * np.array([-z, x]) / inertia
+        wanted[0, 2 * end : 2 * end + 2] -= GRAVITY * pitch_acceleration * duration**3 / 6
     scale = np.abs(wanted).max(axis=1, keepdims=True)
     return float((np.abs(total[STATE_ROWS][3:5] - wanted) / scale).max())
 

@@ -12,7 +12,7 @@ linearises it where the robot is (``operating_point``), which for a linear famil
     srb           [1, x]                   the rigid body itself, feet fixed in the body
     planted       [1, x]                   the same with feet that stay on the ground
     exact         [1, x]                   planted, forces in the frame of the start: bilinear
-    residual      [1, x, (u-, waves)]      planted + W phi(x, u, u-, waves)
+    residual      [1, x, (u-, harmonics)]  planted + W phi(x, u, u-, harmonics)
     learned       [1, x, MLP(x)]           A z + sum_i z_i B_i u      (``learned``)
 """
 
@@ -176,11 +176,11 @@ def exact(dt: float) -> Family:
         arm = ground - p
         moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum()
         # M(t) = moment - t (v x F) - t^2/2 (a x F); a x F holds no F^2, as F x F = 0.
-        turn = v[0] * total[1] - v[1] * total[0]
-        fall = GRAVITY * total[0]
-        omega = x[5] + (dt * moment - dt**2 / 2 * turn - dt**3 / 6 * fall) / inertia
+        v_cross_F = v[0] * total[1] - v[1] * total[0]
+        a_cross_F = GRAVITY * total[0]
+        omega = x[5] + (dt * moment - dt**2 / 2 * v_cross_F - dt**3 / 6 * a_cross_F) / inertia
         theta = x[2] + dt * x[5]
-        theta += (dt**2 / 2 * moment - dt**3 / 6 * turn - dt**4 / 24 * fall) / inertia
+        theta += (dt**2 / 2 * moment - dt**3 / 6 * v_cross_F - dt**4 / 24 * a_cross_F) / inertia
         position = p + dt * v + 0.5 * dt**2 * accel
         return _with_one(jnp.concatenate([position, theta[None], v + dt * accel, omega[None]]))
 
@@ -195,8 +195,8 @@ def residual(
 ) -> Family:
     """``residual``: the planted body and what data adds to it; parameters: ``ResidualModel``.
 
-    The lifted state holds the force of the step before, a delay coordinate, and the place in the
-    stance as four waves. These turn at a constant rate, which is linear: so a drift that changes
+    The lifted state holds the force of the step before, a delay coordinate, and the stance phase as
+    four harmonics. These advance at a constant rate, which is linear: so a drift that changes
     along the stance, and a force that arrives late, stay in a model that is linearised only once.
 
     Args:
@@ -206,7 +206,7 @@ def residual(
     """
     plain = states_only().names
     forces = tuple(f"last {name}" for name in ("F_x front", "F_z front", "F_x rear", "F_z rear"))
-    names = (*plain, *forces, "sin turn", "cos turn", "sin 2 turn", "cos 2 turn")
+    names = (*plain, *forces, "sin phase", "cos phase", "sin 2 phase", "cos 2 phase")
     state, last = len(plain), len(plain) + len(forces)
 
     def lift(_: Any, start: Start) -> Array:
@@ -225,8 +225,8 @@ def residual(
         next_state = _with_one(nominal + params.W @ features(start, x, u, past))
         if not remembers:
             return next_state
-        single = _turned(past.harmonics[:2], start.stance_phase_rate * dt)
-        double = _turned(past.harmonics[2:], 2 * start.stance_phase_rate * dt)
+        single = _advanced(past.harmonics[:2], start.stance_phase_rate * dt)
+        double = _advanced(past.harmonics[2:], 2 * start.stance_phase_rate * dt)
         return jnp.concatenate([next_state, u, single, double])
 
     return Family("residual", dt, names if remembers else plain, lift, step)
@@ -244,10 +244,10 @@ def phase_harmonics(stance_phase: Float[Array, "*V"]) -> Float[Array, "4 *V"]:
     )
 
 
-def _turned(wave: Float[Array, "2"], angle: Array | float) -> Float[Array, "2"]:
-    """Sine and cosine, an angle later."""
+def _advanced(harmonic: Float[Array, "2"], angle: Array | float) -> Float[Array, "2"]:
+    """Sine and cosine of a phase that is further by an angle."""
     c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([wave[0] * c + wave[1] * s, wave[1] * c - wave[0] * s])
+    return jnp.stack([harmonic[0] * c + harmonic[1] * s, harmonic[1] * c - harmonic[0] * s])
 
 
 def affine_features(start: Start, x: Array, u: Array) -> Float[Array, "17"]:

@@ -23,7 +23,7 @@ class GaitPhase(NamedTuple):
     Attributes:
       u_before: (4,) force of the same legs in the tick before [N].
       elapsed: since the phase began [s].
-      left: until it ends, this step included [s].
+      left: time left of it, this step included [s].
     """
 
     u_before: Float[Array | np.ndarray, "*V 4"]
@@ -46,7 +46,7 @@ def clock(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "25"]:
 
     The legs in the air swing as fast as the robot walks, and their inertia turns the body.
     """
-    return jnp.concatenate([affine_features(start, x, u), _turning(x, phase)])
+    return jnp.concatenate([affine_features(start, x, u), _phase_terms(x, phase)])
 
 
 def history(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "21"]:
@@ -56,7 +56,7 @@ def history(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "21"]:
 
 def clock_history(start: Start, x: Array, u: Array, phase: Any) -> Float[Array, "29"]:
     """Affine, harmonics of the phase and the force before."""
-    return jnp.concatenate([affine_features(start, x, u), phase.u_before, _turning(x, phase)])
+    return jnp.concatenate([affine_features(start, x, u), phase.u_before, _phase_terms(x, phase)])
 
 
 # Those that an LMPC can predict with.
@@ -75,15 +75,15 @@ def touchdown(dt: float, ticks: int = 3) -> Features:
 
     def features(start: Start, x: Array, u: Array, phase: GaitPhase) -> Array:
         count = jnp.arange(ticks)
-        after = jnp.round(phase.elapsed / dt) == count
-        before = jnp.round(phase.left / dt) == count + 1
-        near = jnp.concatenate([after, before]).astype(x.dtype)
+        begun = jnp.round(phase.elapsed / dt) == count
+        closing = jnp.round(phase.left / dt) == count + 1
+        near = jnp.concatenate([begun, closing]).astype(x.dtype)
         slopes = (near[:, None] * jnp.stack([x[2], x[4], x[5]])).reshape(-1)
-        lost = (near[:ticks, None] * u).reshape(-1)  # a foot that is late carries nothing
-        return jnp.concatenate([clock_history(start, x, u, phase), near, slopes, lost])
+        unloaded = (near[:ticks, None] * u).reshape(-1)  # a foot that is late carries nothing
+        return jnp.concatenate([clock_history(start, x, u, phase), near, slopes, unloaded])
 
     return features
 
 
-def _turning(x: Array, phase: Any) -> Float[Array, "8"]:
+def _phase_terms(x: Array, phase: Any) -> Float[Array, "8"]:
     return jnp.concatenate([phase.harmonics, x[3] * phase.harmonics])

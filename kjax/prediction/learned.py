@@ -142,7 +142,7 @@ def _units(params: LearnedModel, data: Snapshots) -> tuple[tuple[Layer, ...], Bi
     """What a change of 1 means for each trained number: that of the network's is its own.
 
     An entry of the head is measured by the change of its observable in a step over the size of
-    what it multiplies: one rate then suits a velocity's response to a newton and a wave's decay.
+    what it multiplies: one rate then suits a velocity's response to a newton and a slow decay.
     """
     lifted = jax.vmap(jax.vmap(lambda x: lift(params, x)))(data.states)
     change = jnp.diff(lifted, axis=1).std(axis=(0, 1))

@@ -79,7 +79,7 @@ def load(path: str | Path, family: str) -> Stored:
       family: ``"residual"`` or ``"learned"``.
 
     Raises:
-      ValueError: in one line that names the file and the fault: not there, not readable, not a
+      ValueError: in one line that names the file and the fault: missing, unreadable, not a
         model's, of another family, or with an array that is missing, not real, not finite, or of
         another shape than the family and the other arrays ask for.
     """
@@ -163,16 +163,16 @@ def _is_word(value: np.ndarray | None) -> bool:
 def _check_array(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
     """Raise a ValueError that says what is wrong with an array of a model."""
     if values.dtype.kind == "c":
-        raise ValueError(f"{name} holds complex numbers, wanted real ones")
+        raise ValueError(f"{name} holds complex values, wanted real ones")
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"{name} holds values of type {values.dtype}, wanted real numbers")
+        raise ValueError(f"{name} holds values of type {values.dtype}, wanted real values")
     if shape and values.ndim == len(shape) and len(values) != len(Mode):
         text = f"{name} holds {len(values)} contact modes, wanted {len(Mode)}"
         raise ValueError(text + ": fit it again, kjax had 5 before" * (len(values) == 5))
     if values.shape != shape:
         raise ValueError(f"{name} has shape {values.shape}, wanted {shape}")
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds numbers that are not finite")
+        raise ValueError(f"{name} holds values that are not finite")
 
 
 def _residual_shapes(features: str) -> dict[str, tuple[int, ...]]:

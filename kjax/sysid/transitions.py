@@ -51,7 +51,7 @@ class Transitions(NamedTuple):
       mode: (M,) contact mode scheduled.
       next_mode: (M,) contact mode of the phase that follows.
       elapsed: (M,) time since the phase began [s].
-      left: (M,) time until it ends, this tick included [s].
+      left: (M,) time left of it, this tick included [s].
       new: (M,) whether other feet stand than in the tick before.
       held: (M,) whether all feet scheduled to stand touch the ground, at both ends of the tick.
       clear: (M,) whether no other foot does.
@@ -90,7 +90,7 @@ class Transitions(NamedTuple):
 
 
 def transitions(
-    episodes: Sequence[Episode], *, dt: float, sole: float, numbers: Sequence[int] | None = None
+    episodes: Sequence[Episode], *, dt: float, sole: float, ids: Sequence[int] | None = None
 ) -> Transitions:
     """Transitions of episodes; a phase that the end of the episode cuts off is left out.
 
@@ -98,15 +98,15 @@ def transitions(
       episodes: of robots.
       dt: control tick [s].
       sole: height of a foot's centre above its contact point [m].
-      numbers: of the episodes; 0, 1, ... if ``None``.
+      ids: of the episodes; 0, 1, ... if ``None``.
 
     Raises:
       ValueError: if no episode holds a whole phase, or legs stand that no contact mode has.
     """
-    numbers = range(len(episodes)) if numbers is None else numbers
+    ids = range(len(episodes)) if ids is None else ids
     parts = [
         part
-        for number, episode in zip(numbers, episodes, strict=True)
+        for number, episode in zip(ids, episodes, strict=True)
         if (part := _of_episode(episode, number, dt, sole)) is not None
     ]
     if not parts:
@@ -120,7 +120,7 @@ def split(
     """Episodes to fit on and episodes held out, whole ones, each in rising order.
 
     Args:
-      episodes: their numbers.
+      episodes: their ids.
       share: of those held out [-].
       seed: of the draw.
     """
@@ -145,8 +145,8 @@ def _of_episode(episode: Episode, number: int, dt: float, sole: float) -> Transi
     tick = np.arange(last)
     mode = _modes(stance)
     legs = stance.reshape(-1, 2, 2)
-    ends = (np.asarray(episode.feet, float) - [0.0, sole]).reshape(-1, 2, 2, 2)
-    ground = _mean_of(ends, np.where(legs.any(axis=2, keepdims=True), legs, True))
+    feet = (np.asarray(episode.feet, float) - [0.0, sole]).reshape(-1, 2, 2, 2)
+    ground = _mean_of(feet, np.where(legs.any(axis=2, keepdims=True), legs, True))
     force = _in_body(np.asarray(episode.force, float), np.asarray(episode.x, float)[:, 2])
     before = np.concatenate([np.zeros_like(force[:1]), force[:-1]])
     touch = np.asarray(episode.foot_force) > TOUCH
@@ -162,7 +162,7 @@ def _of_episode(episode: Episode, number: int, dt: float, sole: float) -> Transi
         u=_mean_of(force, legs)[:last].reshape(-1, 4),
         u_before=_mean_of(before, legs)[:last].reshape(-1, 4),
         ground=ground[:last],
-        level=_level(ends[..., 1], legs)[:last],
+        level=_level(feet[..., 1], legs)[:last],
         mode=mode[:last],
         next_mode=mode[begins[phase + 1]],
         elapsed=dt * (tick - begins[phase]),
@@ -186,18 +186,18 @@ def _modes(stance: Bool[np.ndarray, "T 4"]) -> Int[np.ndarray, "T"]:
 def _in_body(
     force: Float[np.ndarray, "T 4 3"], pitch: Float[np.ndarray, "T"]
 ) -> Float[np.ndarray, "T 2 2 2"]:
-    """Forces (x, z) of the legs by end, in the axes of the pitched body."""
+    """Forces (x, z) of the legs by pair, in the axes of the pitched body."""
     c, s = np.cos(pitch)[:, None], np.sin(pitch)[:, None]
     x, z = force[..., 0], force[..., 2]
     return np.stack([c * x + s * z, c * z - s * x], axis=-1).reshape(-1, 2, 2, 2)
 
 
 def _mean_of(
-    ends: Float[np.ndarray, "T 2 2 2"], legs: Bool[np.ndarray, "T 2 2"]
+    values: Float[np.ndarray, "T 2 2 2"], legs: Bool[np.ndarray, "T 2 2"]
 ) -> Float[np.ndarray, "T 2 2"]:
-    """Mean over the chosen legs of each end, 0 without any."""
+    """Mean over the chosen legs of each pair (front, rear), 0 without any."""
     weight = legs[..., None].astype(float)
-    return (ends * weight).sum(axis=2) / np.maximum(weight.sum(axis=2), 1.0)
+    return (values * weight).sum(axis=2) / np.maximum(weight.sum(axis=2), 1.0)
 
 
 def _level(

@@ -73,7 +73,7 @@ def fit(
 
     With several ``steps`` the residuals and the features are summed over so many ticks in a row:
     W then fits the drift of the prediction rather than each tick, in which what one tick loses to
-    the give of a contact and the next one gets back is noise that outweighs it.
+    contact compliance and the next one gets back is noise that outweighs it.
 
     Args:
       data: transitions of the episodes to fit on.
@@ -227,9 +227,9 @@ def _summed(
     if steps == 1:
         return values[use]
     first = np.arange(len(use) - steps + 1)
-    after = first + steps - 1
+    last = first + steps - 1
     count = np.r_[0, np.cumsum(use)]
-    same = data.episode[first] == data.episode[after]
+    same = data.episode[first] == data.episode[last]
     whole = (count[first + steps] - count[first] == steps) & same
     # One phase: no row after the first begins a new one.
     begun = np.r_[0, np.cumsum(data.new)]

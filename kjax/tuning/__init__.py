@@ -1,1 +1,1 @@
-"""Derivatives of a closed loop: a rigid body on legs without mass, walked by the controller."""
+"""Derivatives of a closed loop: a rigid body on legs without mass under the controller."""

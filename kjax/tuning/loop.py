@@ -5,7 +5,7 @@
 A run is a pure function of the controller's parameters and a scenario. Stances, flights and
 touchdown times come from the schedule; where a foot comes down follows from the state. Derivatives
 go through all of it, the QPs' active sets as they are. Reverse mode keeps the states at the
-beginnings of some sqrt(T) segments and walks each segment again.
+beginnings of some sqrt(T) segments and computes each segment again.
 """
 
 from collections.abc import Callable
@@ -47,7 +47,7 @@ class Scenario(NamedTuple):
     Attributes:
       command: what is asked over time.
       x: (6,) start of the body [m, rad, m/s, rad/s].
-      plant: its numbers.
+      plant: its parameters.
       noise: (6,) standard deviation of what is measured of x [m, rad, m/s, rad/s].
       key: of the noise, key data.
     """
@@ -133,17 +133,17 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
         plant = scenario.plant
         own = _Run(params, tables, scenario, jax.random.wrap_key_data(scenario.key))
 
-        def stretch(carry: _Carry, numbers: Array) -> tuple[_Carry, Trace]:
-            return jax.lax.scan(partial(step, own), carry, numbers)
+        def stretch(carry: _Carry, indices: Array) -> tuple[_Carry, Trace]:
+            return jax.lax.scan(partial(step, own), carry, indices)
 
-        numbers = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
+        indices = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
         feet = _standing(params, plant, scenario.x)
         state = controller.init_from(
             tables, body_plant.local_view(params.robot, plant.com, scenario.x, feet)
         )
         none = jnp.zeros_like(feet)
         first = _Carry(scenario.x, feet, state, none, none[0, 0], jnp.ones((), bool))
-        _, trace = jax.lax.scan(jax.checkpoint(stretch), first, numbers)
+        _, trace = jax.lax.scan(jax.checkpoint(stretch), first, indices)
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:ticks], trace)
 
     return run
@@ -271,12 +271,12 @@ def _swing(
     place, rate = swing.foot_path(settings, state.swing, target - body.base)
     standing = state.stance[:, None]
     swings = swing.advance(state.swing, ~state.stance, dt)
-    moved = jnp.where(standing, feet, place + body.base)
+    next_feet = jnp.where(standing, feet, place + body.base)
     motion = dt * body.base_vel
     next_state = state._replace(
         swing=swing.carry_along(swings, motion), ground=state.ground - motion[-1]
     )
-    return moved, jnp.where(standing, 0.0, rate), next_state
+    return next_feet, jnp.where(standing, 0.0, rate), next_state
 
 
 class CostWeights(NamedTuple):

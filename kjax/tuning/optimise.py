@@ -4,7 +4,7 @@
 
 A scenario whose cost or gradient is not finite ends the descent at the last good point, and the
 report names it and the parameter. After each look at the held-out scenarios everything is on disk,
-so that the same call goes on after a kill, to the same numbers.
+so that the same call goes on after a kill, to the same result.
 """
 
 import json
@@ -108,13 +108,13 @@ def descend(
       clip: longest gradient of a scenario, in medians over the scenarios.
       every: updates between two looks at the held-out scenarios.
       patience: updates without a better look before it ends.
-      seconds: wall time before it ends, compilation and earlier calls included [s].
+      seconds: wall time before it stops, compilation and earlier calls included [s].
       checkpoint: file to keep the state in; an existing one is gone on from.
       identity: of everything that the result depends on; a checkpoint of another one is refused.
       on_update: called with the update, its cost and the best held-out cost.
 
     Raises:
-      ValueError: for a checkpoint of another tuning, or unusable numbers.
+      ValueError: for a checkpoint of another tuning, or unusable options.
     """
     for name, count in (("updates", updates), ("every", every), ("patience", patience)):
         if count < 1:
@@ -190,7 +190,7 @@ def _build_update(
 
 
 class _Limits(NamedTuple):
-    """When a descent ends: updates, updates without a better look, wall time [s]."""
+    """When a descent stops: updates, updates without a better look, wall time [s]."""
 
     updates: int
     patience: int

@@ -26,7 +26,7 @@ from kjax.types import RobotParams
 
 
 class PlantParams(NamedTuple):
-    """Numbers of the plant; data, so that every scenario may have its own.
+    """Parameters of the plant; data, so that every scenario may have its own.
 
     Attributes:
       mass: [kg].
@@ -202,7 +202,7 @@ def advance(
     """State ``dt`` [s] later, forces held in the body frame; one Runge-Kutta step.
 
     Args:
-      plant: numbers.
+      plant: parameters.
       stance: (4,) legs that stand.
       x: (6,) state.
       contact: (4, 2) contact points of the feet, world [m].

@@ -1,8 +1,8 @@
-"""Numbers of a config as variables, by key, in coordinates in which their steps compare.
+"""Parameters of a config as variables, by key, in coordinates in which their steps compare.
 
 A positive number p is the variable log(p): a step of 0.1 is one of ten per cent, of a weight of 3e4
-and of one of 0.1 alike. Others are divided by a size that matters. ``params`` maps variables to all
-numbers of a controller by the same code that builds them from a config, and may be differentiated.
+and of one of 0.1 alike. Others are divided by a size that matters. ``params`` maps variables to the
+parameters of a controller by the same code that builds them from a config; it is differentiable.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ class Space(NamedTuple):
     Attributes:
       kinds: in which coordinate and range each key is tuned.
       start: variables of the config itself.
-      values: variables -> numbers by key.
+      values: variables -> values by key.
       inside: variables -> the nearest ones in their ranges.
       params: variables -> controller parameters; differentiable.
       overrides: variables -> plain values by key, for ``config.load_config`` and TOML.
@@ -62,7 +62,7 @@ def build_space(
     (gaits.NAME.feet_*, height), models with fixed feet stay those of the config.
 
     Args:
-      config: that all other numbers come from.
+      config: that all other parameters come from.
       keys: of ``TUNABLE``.
       robot: whose controller it is; that of the config if ``None``.
       fits: models; those of the config if ``None``.

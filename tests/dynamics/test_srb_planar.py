@@ -15,7 +15,7 @@ from kjax.types import MODE_ALPHA, Mode, contact_mode
 
 G = 9.81  # m/s^2
 MASS, INERTIA = 12.7, 0.39
-# A few roundings per step over 100 steps, on numbers of order one.
+# A few roundings per step over 100 steps, on values of order one.
 ROUNDING = {"float32": 1e-5, "float64": 1e-13}
 
 rollout = jax.jit(srb_planar.rollout, static_argnames="dt")
@@ -92,7 +92,7 @@ def test_moment_of_a_foot_force_has_the_sign_of_nose_up_pitch(u, nose_up):
 
 
 def test_forces_turn_with_the_body():
-    # Pitched nose-up by a quarter turn, the body's up axis points backward in the world.
+    # Pitched nose-up by 90 degrees, the body's up axis points backward in the world.
     x = jnp.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0])
     accel = dynamics(make(jnp.float64), jnp.ones(2), x, jnp.array([0.0, MASS, 0.0, 0.0]))[3:5]
     # cos(pi/2) is 6e-17 in double precision.

@@ -119,7 +119,7 @@ def test_front_feet_turn_the_nose_up_and_rear_feet_down():
 def test_height_and_pitch_have_no_mean_over_the_two_stances(name):
     _, modes, reference = make(name)
     standing = [i for i, mode in enumerate(modes) if mode != Mode.FLIGHT]
-    # Rounding of the mean of 102 numbers.
+    # Rounding of the mean of 102 values.
     np.testing.assert_allclose(reference.rows[standing, :, :2].mean(axis=(0, 1)), 0, atol=1e-15)
 
 

@@ -61,7 +61,7 @@ def begin(index, dt, dtype="float64"):
 
 
 @partial(jax.jit, static_argnames=("dt", "ticks"))
-def walk(schedule, clock, dt, ticks):
+def run_clock(schedule, clock, dt, ticks):
     def tick(clock, _):
         clock = gait.advance(schedule, clock, dt)
         return clock, clock
@@ -71,7 +71,7 @@ def walk(schedule, clock, dt, ticks):
 
 def record(schedule, *, dt, ticks, index=0, dtype="float64"):
     """Phase and elapsed time at each of ``ticks`` ticks."""
-    clocks = walk(cast(schedule, dtype), begin(index, dt, dtype), dt, ticks)
+    clocks = run_clock(cast(schedule, dtype), begin(index, dt, dtype), dt, ticks)
     return np.asarray(clocks.phase), np.asarray(clocks.elapsed)
 
 
@@ -281,7 +281,7 @@ def ramp():
     dt = 0.005
     begins = unrolled(15)
     schedule = gait.build_schedule([trot(0.25), ramped()])
-    clocks = walk(schedule, begin(1, dt), dt, int(begins[-1] / dt))
+    clocks = run_clock(schedule, begin(1, dt), dt, int(begins[-1] / dt))
     waits = jax.jit(jax.vmap(partial(gait.time_to_touchdown, schedule)))(clocks)
     lengths = jax.jit(jax.vmap(partial(gait.phase_duration, schedule)))(clocks)
     return dt, begins, jax.device_get(clocks), np.asarray(waits), np.asarray(lengths)
@@ -416,7 +416,7 @@ def test_a_trot_is_left_at_the_tick_asked_for():
     np.testing.assert_array_equal(entered.elapsed, 0.0)
     np.testing.assert_array_equal(entered.cycle, 0)
     # From there on it is the bound that a robot starts with.
-    fresh = np.asarray(walk(gaits(), begin(BOUNDING, TICK), TICK, int(CYCLE)).phase)
+    fresh = np.asarray(run_clock(gaits(), begin(BOUNDING, TICK), TICK, int(CYCLE)).phase)
     for robot, tick in enumerate(ASKED):
         np.testing.assert_array_equal(clocks.phase[robot, tick : tick + CYCLE], fresh)
 
@@ -477,7 +477,7 @@ def test_wanting_the_gait_one_is_in_changes_nothing(index):
     schedule = gaits(anywhere=True, landing=True)
     clock = begin(index, TICK)
     wanted = follow(schedule, clock, np.full((1, LENGTH), index), TICK)
-    left_alone = walk(schedule, clock, TICK, int(LENGTH))
+    left_alone = run_clock(schedule, clock, TICK, int(LENGTH))
     chex.assert_trees_all_equal(jax.tree.map(lambda a: a[0], wanted), left_alone)
 
 
@@ -488,7 +488,7 @@ def test_a_request_withdrawn_before_it_may_be_met_changes_nothing():
     wanted = np.where((tick >= flights[0]) & (tick < flights[1]), TROT, BOUNDING)
     clocks = follow(schedule, clock, wanted[None], TICK)
     chex.assert_trees_all_equal(
-        jax.tree.map(lambda a: a[0], clocks), walk(schedule, clock, TICK, int(LENGTH))
+        jax.tree.map(lambda a: a[0], clocks), run_clock(schedule, clock, TICK, int(LENGTH))
     )
     # One tick more and it is met.
     late = np.where(tick == flights[1], TROT, wanted)[None]
@@ -587,8 +587,8 @@ def test_legs_of_any_gait_stand_from_their_touchdown_for_their_duty_factor(seed)
     offset, duty = rng.uniform(0, 1, 4), rng.uniform(0.1, 0.95, 4)
     found = gait.phases(1.0, offset.tolist(), duty.tolist())
     begin = min(list(offset) + list((offset + duty) % 1.0))
-    ends = begin + np.cumsum([phase.duration for phase in found])
-    assert ends[-1] == pytest.approx(begin + 1.0, abs=1e-12)
+    phase_ends = begin + np.cumsum([phase.duration for phase in found])
+    assert phase_ends[-1] == pytest.approx(begin + 1.0, abs=1e-12)
     for at in begin + (np.arange(500) + 0.5) / 500:
-        phase = found[int(np.searchsorted(ends, at))]
+        phase = found[int(np.searchsorted(phase_ends, at))]
         assert phase.stance == tuple((at - offset) % 1.0 < duty)

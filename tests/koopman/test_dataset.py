@@ -54,8 +54,8 @@ def test_each_rollout_obeys_the_dynamics_with_its_own_contact_points(
 def test_samples_fill_their_ranges_and_stay_inside(snapshots, snapshots_moving_feet, body):
     start, inputs = snapshots.states[:, :, 0], snapshots.inputs
     half = np.array([0.5, 0.1, 0.3, 1.0, 0.5, 2.0])
-    centre = np.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0])
-    spread = (np.asarray(start).reshape(-1, 6) - centre) / half
+    middle = np.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0])
+    spread = (np.asarray(start).reshape(-1, 6) - middle) / half
     forces = np.asarray(inputs).reshape(-1, 4)
     low, high = np.array([-60.0, 0.0, -60.0, 0.0]), np.array([60.0, 150.0, 60.0, 150.0])
     shift = np.asarray((snapshots_moving_feet.feet - body.feet) / jnp.array([0.12, 0.05]))
@@ -117,7 +117,7 @@ def test_ranges_come_from_the_spec_in_the_order_of_state_and_input():
 def test_shrinking_keeps_the_centres_and_scales_the_widths(ranges):
     half = dataset.shrink(ranges, jnp.asarray(0.5))
     np.testing.assert_array_equal(half.state_centre, ranges.state_centre)
-    # Rounding of the scaled ends, at most 150 N.
+    # Rounding of the scaled bounds, at most 150 N.
     np.testing.assert_allclose(half.state_half, 0.5 * ranges.state_half, rtol=1e-15)
     np.testing.assert_allclose(half.input_low, [-30.0, 37.5, -30.0, 37.5], rtol=0, atol=1e-13)
     np.testing.assert_allclose(half.input_high, [30.0, 112.5, 30.0, 112.5], rtol=0, atol=1e-13)

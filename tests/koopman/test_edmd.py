@@ -140,7 +140,7 @@ def test_pitch_acceleration_is_modelled_exactly_for_fixed_contact_points(mode, f
     row = pick(fitted[0], mode).B[6]
     alpha, r = np.repeat(MODE_ALPHA[mode], 2), np.asarray(body.feet)
     arms = np.array([-r[0, 1], r[0, 0], -r[1, 1], r[1, 0]])
-    # Rounding 2e-16 times condition 1e3 on numbers of 1e-3.
+    # Rounding 2e-16 times condition 1e3 on values of 1e-3.
     np.testing.assert_allclose(row, DT * alpha * arms / body.inertia, rtol=0, atol=1e-15)
 
 

@@ -220,7 +220,7 @@ def test_a_family_refuses_delay_coordinates(family):
 
 
 def cut(data, lengths):
-    """Episodes of these numbers of steps, from rollouts."""
+    """Episodes of these lengths, from rollouts."""
     return [
         (data.states[i, : n + 1], data.inputs[i, :n], data.feet[i]) for i, n in enumerate(lengths)
     ]

@@ -106,13 +106,13 @@ def test_derivatives_are_finite_with_feet_that_press_nothing_and_agree_with_diff
         for index in ((1,), (4,)) if argument == 0 else ((0, 0), (3, 2)):
             step = np.zeros(values.shape)
             step[index] = 1e-5
-            ends = [
+            totals = [
                 total(wrench + s * step, planned)
                 if argument == 0
                 else total(wrench, planned + s * step)
                 for s in (1, -1)
             ]
-            wanted = float(ends[0] - ends[1]) / 2e-5
+            wanted = float(totals[0] - totals[1]) / 2e-5
             np.testing.assert_allclose(slope[index], wanted, rtol=1e-6, atol=1e-6)
 
 

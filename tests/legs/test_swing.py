@@ -387,8 +387,8 @@ def test_a_foot_held_for_a_moment_goes_on_with_its_path():
     held = swing.hold_feet(settings(), swinging(0.15), flags_of(hit, blocked=hit), feet, 0.001)
     assert held.held.tolist() == [True, True, False, False]
     over = flags_of(NONE, flicker=jnp.array([True, False, False, False]))
-    after = swing.hold_feet(settings(), held, over, feet, 0.001)
-    assert after.held.tolist() == [False, True, False, False]
+    released = swing.hold_feet(settings(), held, over, feet, 0.001)
+    assert released.held.tolist() == [False, True, False, False]
 
 
 def test_points_stay_where_they_are_when_the_frame_moves_on():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax.mpc.condense import cautious_weights, condense
+from kjax.mpc.condense import condense, discounted_weights
 
 N, K = 9, 5  # observables, steps
 Q = np.array([3.0, 5.0, 2.0, 0.5, 0.7, 0.1])
@@ -122,13 +122,13 @@ def test_caution_weighs_what_grows_uncertain_less():
     A[1, 4] = 0.1  # p_x from v_x
     weights = jnp.asarray([2.0, 1.0, 1.0, 3.0, 1.0, 1.0])
     spread = jnp.asarray([0.0, 0.0, 0.0, 0.5, 0.0, 0.0])
-    got = cautious_weights(jnp.asarray(A), weights, spread, 0.5, 6)
+    got = discounted_weights(jnp.asarray(A), weights, spread, 0.5, 6)
     i = np.arange(1, 7)
     np.testing.assert_allclose(got[:, 3], 3.0 / (1 + 0.5 * i / i.mean()), rtol=1e-12)
     along = np.cumsum((i - 1) ** 2)  # of p after i steps, in units of (0.1 * 0.5)^2
     np.testing.assert_allclose(got[:, 0], 2.0 / (1 + 0.5 * along / along.mean()), rtol=1e-12)
     np.testing.assert_array_equal(got[:, 1], 1.0)  # nothing uncertain reaches p_z
-    trusting = cautious_weights(jnp.asarray(A), weights, spread, 0.0, 6)
+    trusting = discounted_weights(jnp.asarray(A), weights, spread, 0.0, 6)
     np.testing.assert_array_equal(trusting, np.tile(weights, (6, 1)))
 
 

@@ -1,4 +1,4 @@
-"""Tables and plans: the closed-form regulator, bounds, swing ends, contact points."""
+"""Tables and plans: the closed-form regulator, bounds, swing legs, contact points."""
 
 import dataclasses
 from functools import partial
@@ -340,8 +340,8 @@ def test_the_contact_points_of_each_mode_enter_its_own_tables(fitted_moving_feet
     settings = mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
     arguments = {"steps": 5, "horizon": 4}
     same = jnp.tile(body.feet, (len(Mode), 1, 1))
-    moved = same.at[Mode.FRONT, 0, 0].add(0.05)
-    one, other = (condense_all(model, settings, **arguments, feet=feet) for feet in (same, moved))
+    shifted = same.at[Mode.FRONT, 0, 0].add(0.05)
+    one, other = (condense_all(model, settings, **arguments, feet=feet) for feet in (same, shifted))
     for mode in Mode:
         change = np.abs(np.asarray(other.F[mode] - one.F[mode])).max()
         if mode == Mode.FRONT:

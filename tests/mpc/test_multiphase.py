@@ -230,9 +230,9 @@ def test_torque_rows_are_c_mujocos_jacobian(params, schedule, forecast_of, plana
         point = data.geom_xpos[geom]
         mujoco.mj_jac(planar_go1, data, jacobian, None, point, planar_go1.geom_bodyid[geom])
         J = jacobian[[0, 2]][:, dofs]
-        miss = target - point[[0, 2]]
-        data.qpos[joints] += np.linalg.solve(J, np.clip(miss, -0.02, 0.02))
-    assert np.abs(miss).max() < 1e-9
+        error = target - point[[0, 2]]
+        data.qpos[joints] += np.linalg.solve(J, np.clip(error, -0.02, 0.02))
+    assert np.abs(error).max() < 1e-9
     np.testing.assert_allclose(rows[0, 2:], J.T, atol=1e-6)
 
 

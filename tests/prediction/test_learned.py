@@ -126,7 +126,7 @@ def test_a_learned_model_comes_back_from_disk(trained, tmp_path):
     [
         ({"family": "residual"}, "holds residual, wanted a learned model"),
         ({"A": None}, "lacks 'A'"),
-        ({"centre": np.full((len(Mode), 6), np.nan)}, "centre holds numbers that are not finite"),
+        ({"centre": np.full((len(Mode), 6), np.nan)}, "centre holds values that are not finite"),
         ({"dt": 0.005}, "steps of 0.005 s, dataset.dt is 0.001 s"),
         ({"spread": np.zeros((3, 6))}, f"holds 3 contact modes, wanted {len(Mode)}"),
     ],
@@ -276,7 +276,7 @@ def put(index, value):
     ("changes", "message"),
     [
         ({"states": put((3, 7, 2), np.nan)}, "states: 1 of 6 rollouts.*the first one is rollout 3"),
-        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold numbers that are not"),
+        ({"inputs": put((0, 0), np.inf)}, "inputs: 1 of 6 rollouts hold values that are not"),
         ({"states": lambda a: a[..., :5]}, r"states: got shape \(6, 21, 5\), wanted"),
         ({"inputs": lambda a: a[:, :-1]}, r"inputs: got shape \(6, 19, 4\), wanted \(6, 20, 4\)"),
         ({"feet": lambda a: a[:1]}, r"feet: got shape \(1, 2, 2\), wanted \(6, 2, 2\)"),

@@ -161,7 +161,7 @@ def test_a_damaged_byte_is_refused_or_does_not_matter(tmp_path, stored, family):
         ({"W": np.zeros((6, 29))}, f"W has shape (6, 29), wanted ({M}, 6, 29)"),
         ({"W": np.zeros((5, 6, 29))}, f"W holds 5 contact modes, wanted {M}: fit it again"),
         ({"W": np.zeros((3, 6, 29))}, f"W holds 3 contact modes, wanted {M}"),
-        ({"W": np.zeros((M, 6, 29), complex)}, "W holds complex numbers"),
+        ({"W": np.zeros((M, 6, 29), complex)}, "W holds complex values"),
         ({"W": np.full((M, 6, 29), "a")}, "W holds values of type <U1"),
         ({"W": np.zeros((M, 6, 29), bool)}, "W holds values of type bool"),
         ({"W": np.zeros((0, 6, 29))}, f"W holds 0 contact modes, wanted {M}"),
@@ -172,9 +172,9 @@ def test_a_damaged_byte_is_refused_or_does_not_matter(tmp_path, stored, family):
         ({"spread": None}, "lacks 'spread'"),
         ({"dt": np.array([0.005, 0.005])}, "dt has shape (2,), wanted ()"),
         ({"dt": np.array(0.0)}, "dt holds 0, wanted values above 0"),
-        ({"dt": np.array(0.005 + 0j)}, "dt holds complex numbers"),
+        ({"dt": np.array(0.005 + 0j)}, "dt holds complex values"),
         ({"dt": np.array("0.005")}, "dt holds values of type <U5"),
-        ({"dt": np.array(np.nan)}, "dt holds numbers that are not finite"),
+        ({"dt": np.array(np.nan)}, "dt holds values that are not finite"),
     ],
 )
 def test_an_array_that_does_not_fit_a_residual_is_named(tmp_path, change, said):
@@ -202,7 +202,7 @@ def test_an_array_that_does_not_fit_a_residual_is_named(tmp_path, change, said):
         ),
         ({"centre": np.zeros((M, 5))}, f"centre has shape ({M}, 5), wanted ({M}, 6)"),
         ({"scale": np.zeros((M, 6))}, "scale holds 0, wanted values above 0"),
-        ({"A": np.zeros((M, 10, 10), np.complex64)}, "A holds complex numbers"),
+        ({"A": np.zeros((M, 10, 10), np.complex64)}, "A holds complex values"),
     ],
 )
 def test_an_array_that_does_not_fit_a_learned_model_is_named(tmp_path, change, said):

@@ -128,7 +128,7 @@ def test_a_solution_is_within_bounds_and_stationary(factor, q, low, width, metho
 
 @pytest.mark.parametrize("exponent", [-13, -4, 4, 13])
 def test_scaling_the_cost_by_a_power_of_four_changes_no_bit(random_qp, method, dtype, exponent):
-    """Powers of four have exact roots, so even the iterates must be the same numbers."""
+    """Powers of four have exact roots, so even the iterates must be identical."""
     H, q, lower, upper, _ = cast(random_qp(2), dtype)
     options = {"method": method, "tolerance": TOLERANCE[dtype.name]}
     plain = solve(H, q, lower, upper, **options)
@@ -296,7 +296,7 @@ def test_a_bad_problem_in_a_batch_leaves_its_neighbours_alone(random_qp, method)
     np.testing.assert_array_equal(healthy.status, Status.SOLVED)
     for seed in range(4):
         single = solve(*cast(problems[seed]), method=method, tolerance=1e-10)
-        # Batched sums round differently: 2e-16 on numbers of order one, times the condition of 100.
+        # Batched sums round differently: 2e-16 on values of order one, times the condition of 100.
         np.testing.assert_allclose(healthy.x[seed], single.x, rtol=0, atol=1e-12)
     for bad, status in (
         ([good[0], good[1].at[1].set(jnp.nan), *good[2:]], Status.NON_FINITE),

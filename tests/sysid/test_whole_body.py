@@ -42,7 +42,7 @@ def stepper(body, W):
     return jax.jit(step)
 
 
-def walk(seed, body, W, *, phases=4, lost=()):
+def record_episode(seed, body, W, *, phases=4, lost=()):
     """A trot of the planted body plus W phi; new feet come down beneath where it is then."""
     rng = np.random.default_rng(seed)
     ticks = PHASE * phases + 3  # the last phase is cut off
@@ -59,14 +59,15 @@ def walk(seed, body, W, *, phases=4, lost=()):
         feet[t] = np.where(stance[t, :, None] & (not touches), feet[t - 1], fresh)
         if touches and t > 0:  # feet that lift do so after the sample that ends their last tick
             feet[t] = np.where(stance[t, :, None], fresh, feet[t - 1])
-        ends = np.array([0.0, 62.0]) + 20.0 * rng.normal(size=(2, 2))
+        pair_force = np.array([0.0, 62.0]) + 20.0 * rng.normal(size=(2, 2))
         c, s = np.cos(x[t, 2]), np.sin(x[t, 2])
-        world = ends @ np.array([[c, -s], [s, c]]).T  # the body's model takes them in its axes
+        # The body's model takes them in its axes.
+        world = pair_force @ np.array([[c, -s], [s, c]]).T
         force[t, :, ::2] = np.where(stance[t, :, None], np.repeat(world, 2, axis=0), 0.0)
         front, rear = (feet[t, legs][stance[t, legs]][0] for legs in (slice(0, 2), slice(2, 4)))
         ground = np.stack([front, rear]) - [0.0, SOLE]
         if t + 1 < ticks:
-            x[t + 1] = step(x[t], ends.reshape(4), ground)
+            x[t + 1] = step(x[t], pair_force.reshape(4), ground)
     # A sensor shows the physics step before: at a change still the old feet.
     touch = np.where(stance[np.maximum(np.arange(ticks) - 1, 0)], 60.0, 0.0)
     for tick, leg in lost:
@@ -81,7 +82,7 @@ def weights():
 
 @pytest.fixture(scope="module")
 def episodes(body, weights):
-    return [walk(seed, body, weights) for seed in range(10)]
+    return [record_episode(seed, body, weights) for seed in range(10)]
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +184,8 @@ def test_place_in_the_gait_and_forces_are_those_of_the_schedule(data, episodes):
 
 
 def test_lost_early_and_slipping_contacts_are_marked(body, weights):
-    whole = walk(0, body, weights, lost=[(5, 0)])  # a stance leg, seen at the end of tick 4
+    # The flag of a stance leg is lost, seen at the end of tick 4.
+    whole = record_episode(0, body, weights, lost=[(5, 0)])
     touch = np.array(whole.foot_force)
     touch[20, 3] = 50.0  # a leg in the air
     feet = np.array(whole.feet)
@@ -281,7 +283,7 @@ def test_the_interval_of_a_ratio_holds_it_and_draws_whole_episodes():
 
 
 def test_what_cannot_be_used_is_said(body, weights):
-    one = walk(0, body, weights)
+    one = record_episode(0, body, weights)
     still = one._replace(stance=np.ones_like(one.stance))
     with pytest.raises(ValueError, match="at least one whole phase"):
         transitions([still], dt=DT, sole=SOLE)
