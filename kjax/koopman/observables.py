@@ -208,5 +208,5 @@ def _dictionary(
 
 def __getattr__(name: str) -> object:
     if name == "own":
-        raise AttributeError("kjax.koopman.observables.own is now custom_dictionary")
+        raise ImportError("kjax.koopman.observables.own is now custom_dictionary")
     raise AttributeError(f"module 'kjax.koopman.observables' has no attribute '{name}'")

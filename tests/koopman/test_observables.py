@@ -88,3 +88,9 @@ def test_order_zero_keeps_the_state_alone():
 def test_a_negative_order_is_refused_by_name():
     with pytest.raises(ValueError, match=r"order .*-1"):
         paper(-1)
+
+
+def test_the_old_name_of_custom_dictionary_says_the_new_one():
+    # An AttributeError would be swallowed by the import statement.
+    with pytest.raises(ImportError, match="is now custom_dictionary"):
+        from kjax.koopman.observables import own  # noqa: F401
