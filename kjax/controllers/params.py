@@ -12,7 +12,7 @@ from kjax import gait
 from kjax.controllers.observation import is_concrete
 from kjax.koopman.models import LinearModel
 from kjax.legs import lateral, swing
-from kjax.mpc import multiphase
+from kjax.mpc import horizon
 from kjax.mpc.lmpc import LmpcTables, ModeSettings, build_tables
 from kjax.prediction.build import Prediction
 from kjax.spec import ControllerSpec
@@ -77,7 +77,7 @@ class ControllerParams(NamedTuple):
     gait_times: Float[Array, "K"]
     gaits: Int[Array, "K"]
     reference: Float[Array, "G levels P samples 4"]
-    multiphase: multiphase.MultiPhaseParams
+    multiphase: horizon.MultiPhaseParams
     swing: swing.SwingParams
     lateral: lateral.LateralParams
     command: Command

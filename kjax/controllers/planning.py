@@ -15,7 +15,7 @@ from kjax import gait, qp
 from kjax.controllers.params import ControllerParams, Tables
 from kjax.koopman.models import LinearModel, input_map
 from kjax.legs.kinematics import PlanarState
-from kjax.mpc import multiphase
+from kjax.mpc import horizon, multiphase
 from kjax.mpc.limits import force_limits
 from kjax.mpc.lmpc import LmpcMemory, shift_plan, solve_lmpc
 from kjax.prediction.build import build_family
@@ -198,14 +198,14 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
 
     def plan(tables: Tables, task: ForceTask) -> ForcePlan:
         params, clock, body = tables.params, task.clock, task.body
-        settings = multiphase.for_gait(params.multiphase, clock.gait)
+        settings = horizon.for_gait(params.multiphase, clock.gait)
         schedule = params.schedule
-        nodes = multiphase.build_nodes(settings, schedule, clock, count, shortest)
-        forecast = multiphase.predict(
+        nodes = horizon.build_nodes(settings, schedule, clock, count, shortest)
+        forecast = horizon.predict(
             settings,
             nodes,
             body.x,
-            multiphase.HorizonCommand(
+            horizon.HorizonCommand(
                 position=task.lag,
                 velocity=task.velocity,
                 target=task.command,
@@ -213,7 +213,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
                 height=task.height,
                 periodic=_motion(params, task, nodes.phase, nodes.cycle, nodes.place),
             ),
-            multiphase.Stances(
+            horizon.Stances(
                 ground=jnp.zeros_like(task.lag),
                 feet=_contacts(params.robot, task) + body.x[:2],
                 duration=schedule.duration[clock.gait, nodes.phase],

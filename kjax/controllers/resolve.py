@@ -29,7 +29,7 @@ from kjax.controllers.walkable import (
 from kjax.gait.reference import SAMPLES, periodic_reference
 from kjax.koopman.edmd import Point, fit_modes, stack_bodies
 from kjax.legs import lateral, swing
-from kjax.mpc import multiphase
+from kjax.mpc import horizon
 from kjax.mpc.lmpc import ModeSettings
 from kjax.prediction.build import build_prediction
 from kjax.prediction.evaluation import force_response_error
@@ -319,7 +319,7 @@ def problem_settings(
 
 def multiphase_params(
     gaits: list[gait.Gait], config: InSi, robot: RobotParams
-) -> multiphase.MultiPhaseParams:
+) -> horizon.MultiPhaseParams:
     """Numbers of the multi-phase LMPC; of no effect on gaits without nodes."""
     chosen = config.multiphase
     mass, inertia = body_numbers(config, robot)
@@ -327,7 +327,7 @@ def multiphase_params(
     names = [one.name for one in gaits]
     ends = [levers(config.gaits[name], robot) for name in names]
     feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in ends]
-    return multiphase.MultiPhaseParams(
+    return horizon.MultiPhaseParams(
         nodes=jnp.asarray(cycle_nodes(gaits, config)),
         state_weights=_column(config, names, "Q"),
         input_weight=_column(config, names, "R"),

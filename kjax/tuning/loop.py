@@ -19,20 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
-from kjax import gait
 from kjax.config import NoiseConfig, RunConfig
 from kjax.config.gaits import gait_setting
 from kjax.config.units import in_si
 from kjax.controllers.controller import Controller, build_controller
 from kjax.controllers.params import ControllerParams, Tables, condense
-from kjax.controllers.reference import next_clock
 from kjax.controllers.resolve import controller_spec
 from kjax.controllers.rigid_body import body_numbers
 from kjax.controllers.state import ControllerState
-from kjax.legs import swing
-from kjax.legs.kinematics import PlanarState
 from kjax.robots import get_robot
 from kjax.tuning import plant as body_plant
+from kjax.tuning.feet import standing_feet, swing_feet, touch_down
 from kjax.tuning.plant import PlantParams
 from kjax.types import COMMAND_NAMES, GRAVITY, STATE_DIM, Command, RobotParams
 
@@ -137,7 +134,7 @@ def build_loop(config: RunConfig, *, segment: int | None = None, memory: float =
             return jax.lax.scan(partial(step, own), carry, indices)
 
         indices = np.arange(segments * segment, dtype=np.int32).reshape(segments, segment)
-        feet = _standing(params, plant, scenario.x)
+        feet = standing_feet(params, plant, scenario.x)
         state = controller.init_from(
             tables, body_plant.local_view(params.robot, plant.com, scenario.x, feet)
         )
@@ -180,13 +177,13 @@ def _build_tick(
         error = scenario.noise * jax.random.normal(
             jax.random.fold_in(key, number), (STATE_DIM,), x.dtype
         )
-        feet = _touch_down(params, state, plant, carry, x.at[2:].add(error[2:]), dt)
+        feet = touch_down(params, state, plant, carry.feet, x.at[2:].add(error[2:]), dt)
         measured = x.at[2:].add(error[2:])
         seen = body_plant.local_view(robot, plant.com, measured, feet)
         always = jnp.ones((), bool)
         state, info = controller.plan_from(tables, state, seen, state.stance, always)
         true = body_plant.view(robot, plant.com, x, feet).planar
-        feet, rates, state = _swing(params, state, true, feet, dt)
+        feet, rates, state = swing_feet(params, state, true, feet, dt)
         spin = body_plant.leg_momentum(robot, plant, true, feet, rates)
         # What the legs gain the trunk loses; at the first tick they are as they are.
         turns = (number > 0) & carry.alive
@@ -218,65 +215,6 @@ def _build_tick(
 def _upright(x: Array) -> Array:
     low, high = HEIGHTS
     return (jnp.abs(x[2]) < MAX_PITCH) & (x[1] > low) & (x[1] < high)
-
-
-def _standing(params: ControllerParams, plant: PlantParams, x: Array) -> Array:
-    """Feet (4, 2) of the robot before its first step: where they stand still."""
-    settings = swing.for_gait(params.swing, params.gaits[0])
-    along = x[0] - plant.com[0] + params.robot.hip_pos[:, 0] + settings.offset
-    return jnp.stack([along, jnp.full_like(along, params.robot.foot_radius)], axis=1)
-
-
-def _touch_down(
-    params: ControllerParams,
-    state: ControllerState,
-    plant: PlantParams,
-    carry: _Carry,
-    x: Array,
-    dt: float,
-) -> Array:
-    """Feet (4, 2) with those at their footholds whose stance begins now."""
-    clock = next_clock(params, state, dt)
-    where = (clock.gait, clock.phase)
-    landing = params.schedule.stance[where] & ~state.stance
-    robot = params.robot
-    along = swing.foothold(
-        robot,
-        swing.for_gait(params.swing, clock.gait),
-        body_plant.view(robot, plant.com, x, carry.feet).planar,
-        jnp.zeros((4,), x.dtype),
-        params.schedule.stance_time[where],
-        state.velocity + state.correction[0],
-    )
-    place = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
-    return jnp.where(landing[:, None], place, carry.feet)
-
-
-def _swing(
-    params: ControllerParams, state: ControllerState, body: PlanarState, feet: Array, dt: float
-) -> tuple[Array, Array, ControllerState]:
-    """Feet (4, 2) and their velocities, those in the air on their way; the controller's ``act``."""
-    robot, clock = params.robot, state.clock
-    settings = swing.for_gait(params.swing, clock.gait)
-    along = swing.foothold(
-        robot,
-        settings,
-        body,
-        gait.time_to_touchdown(params.schedule, clock),
-        params.schedule.stance_time[clock.gait, clock.phase],
-        state.velocity + state.correction[0],
-    )
-    target = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
-    # The controller keeps lift-off points relative to the trunk; here everything is in the world.
-    place, rate = swing.foot_path(settings, state.swing, target - body.base)
-    standing = state.stance[:, None]
-    swings = swing.advance(state.swing, ~state.stance, dt)
-    next_feet = jnp.where(standing, feet, place + body.base)
-    motion = dt * body.base_vel
-    next_state = state._replace(
-        swing=swing.carry_along(swings, motion), ground=state.ground - motion[-1]
-    )
-    return next_feet, jnp.where(standing, 0.0, rate), next_state
 
 
 class CostWeights(NamedTuple):

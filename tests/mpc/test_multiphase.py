@@ -12,7 +12,7 @@ from kjax.config import RunConfig, load_config
 from kjax.config.units import in_si
 from kjax.controllers.resolve import multiphase_params
 from kjax.controllers.walkable import build_gaits, cycle_nodes
-from kjax.mpc import multiphase
+from kjax.mpc import horizon, multiphase
 from kjax.robots import go1
 from kjax.spec import CycleSpec
 from kjax.types import GRAVITY, Leg
@@ -53,7 +53,7 @@ def config():
 @pytest.fixture(scope="module")
 def params(config):
     params = multiphase_params(build_gaits(config), in_si(config, go1.PARAMS), go1.PARAMS)
-    return multiphase.for_gait(params, jnp.asarray(BOUND))
+    return horizon.for_gait(params, jnp.asarray(BOUND))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def clock_at(phase, elapsed, cycle=10):
 
 def nodes_at(params, schedule, phase, elapsed, cycle=10):
     clock = clock_at(phase, elapsed, cycle)
-    return multiphase.build_nodes(params, schedule, clock, COUNT, 0.0025)
+    return horizon.build_nodes(params, schedule, clock, COUNT, 0.0025)
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +76,11 @@ def forecast_of(params):
     """Forecast for given nodes, state and command, on flat ground."""
 
     def build(nodes, x, velocity=0.0, command=0.0, slew=2.0, contact=((0.05, 0.0), (-0.1, 0.0))):
-        return multiphase.predict(
+        return horizon.predict(
             params,
             nodes,
             x,
-            multiphase.HorizonCommand(
+            horizon.HorizonCommand(
                 position=x[0],
                 velocity=jnp.asarray(velocity),
                 target=jnp.asarray(command),
@@ -88,7 +88,7 @@ def forecast_of(params):
                 height=jnp.asarray(0.27),
                 periodic=jnp.zeros((COUNT, 4)),
             ),
-            multiphase.Stances(
+            horizon.Stances(
                 ground=jnp.asarray(0.0),
                 feet=jnp.asarray(contact),
                 duration=jnp.asarray(DURATION)[nodes.phase],
