@@ -112,6 +112,8 @@ def fit(
 ) -> tuple[LinearModel, FitReport]:
     """Linear model of one contact mode and a report; ``vmap`` it over modes, seeds, ranges, ridge.
 
+        K = argmin sum_i |Pi(y_i) - Pi(x_i) - K [Pi(x_i); u_i]|^2,   A = I + K_Pi,   B = K_u
+
     Args:
       dictionary: observables.
       data: snapshots of that mode.

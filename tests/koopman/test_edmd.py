@@ -55,6 +55,20 @@ def test_the_fit_equals_numpys_least_squares_in_every_mode(mode, fitted, snapsho
     np.testing.assert_allclose(model.B, B, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("mode", [Mode.TROT, Mode.FRONT])
+def test_the_fit_is_that_of_the_papers_gram_matrices(mode, fitted, snapshots):
+    """K = G_1 G_2^-1, with G_2 the Gram matrix of [Pi; u], which has an inverse."""
+    data, model = pick(snapshots, mode), pick(fitted[0], mode)
+    z = lift_by_hand(data.states)
+    now, then = (a.reshape(-1, z.shape[-1]) for a in (z[:, :-1], z[:, 1:]))
+    Z = np.concatenate([now, data.inputs.reshape(-1, 4)], axis=1)
+    G_1, G_2 = then.T @ Z / len(Z), Z.T @ Z / len(Z)
+    K = G_1 @ np.linalg.pinv(G_2, rcond=1e-14)
+    # The Gram matrix squares the condition of unscaled columns, about 1e5: 2e-16 times 1e10.
+    predicted = now @ model.A.T + Z[:, -4:] @ model.B.T
+    np.testing.assert_allclose(Z @ K.T, predicted, rtol=0, atol=1e-5)
+
+
 def test_single_precision_predicts_like_double(fit_modes, fitted, snapshots):
     single, _ = fit_modes()(cast(snapshots, jnp.float32))
     assert single.A.dtype == single.B.dtype == jnp.float32
