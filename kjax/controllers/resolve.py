@@ -130,7 +130,8 @@ def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
     feet = tuple(_nominal_feet(si, robot, name) for name in names)
     modes = tuple(problem.mode for problem in problems)
     choice = model_choice(si.koopman)
-    of_height = get_kind(choice.model).of_height
+    with koopman_keys():
+        of_height = get_kind(choice.model).of_height
     heights = tuple(gait_setting(si, name, "body_height") if of_height else 0.0 for name in names)
     # What a file holds may have changed since.
     fit = _fit.__wrapped__ if choice.file else _fit

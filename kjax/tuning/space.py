@@ -17,6 +17,7 @@ from jaxtyping import Array
 from kjax.config import Gaits, Overlay, RunConfig, Tunable, load_config, to_dict, tunable
 from kjax.controllers.params import ControllerParams, Fits, cast
 from kjax.controllers.resolve import fit_models, gather
+from kjax.controllers.resolve_model import koopman_keys
 from kjax.controllers.rigid_body import body_numbers
 from kjax.prediction.families import BodyModel
 from kjax.prediction.kind import get_kind
@@ -112,10 +113,12 @@ def _check_keys(config: RunConfig, keys: Sequence[str], kinds: Mapping[str, Tuna
     """Raise a ValueError for keys that are no variables of this config."""
     if not keys:
         raise ValueError("keys must name at least one variable, got none")
+    with koopman_keys():
+        is_body = get_kind(config.koopman.model).is_body
     for key in keys:
         if key not in kinds:
             raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
-        if key.startswith("srb.") and not get_kind(config.koopman.model).is_body:
+        if key.startswith("srb.") and not is_body:
             raise ValueError(
                 f"keys: '{key}' is a variable of models that are the rigid body ('srb', 'planted', "
                 f"'exact') only; got '{config.koopman.model}', which is fitted to data"

@@ -96,6 +96,7 @@ def test_the_mass_of_a_rigid_body_model_is_a_variable_of_its_prediction():
         (["lmpc.state_weight"], {}, "'lmpc.state_weight' is no variable"),
         (["lmpc.control_dt"], {}, "'lmpc.control_dt' is no variable"),
         (["srb.mass"], {}, "fitted to data"),
+        (["lmpc.Q"], {"koopman.model": "linar"}, r"koopman\.model: got 'linar'"),
         ([], {}, "at least one"),
         (
             ["lmpc.Q"],
