@@ -6,6 +6,7 @@ it, ``get_robot`` loads it.
 
 import pkgutil
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
@@ -60,6 +61,7 @@ class Robot:
     joint_zero: np.ndarray = field(default_factory=lambda: np.zeros((4, 3)))
 
 
+@cache
 def robot_names() -> list[str]:
     """Names of the robots that kjax has: the modules beside this one."""
     import kjax.robots as package

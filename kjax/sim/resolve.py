@@ -52,7 +52,8 @@ def resolve_episode(
     if terrain_seed is not None:
         config = replace(config, terrain=replace(config.terrain, seed=terrain_seed))
     spec, params = resolve_scene(config)
-    goal, shared = resolve_goal(config), _controller(config)
+    shared = _controller(config)
+    goal = _goal(config, spec)
     return Episode(
         spec=BatchSpec(controller=_controller_spec(config), scene=spec),
         controller=shared._replace(
@@ -112,10 +113,14 @@ def resolve_scene(config: RunConfig) -> tuple[SceneSpec, EpisodeParams]:
 
 def resolve_goal(config: RunConfig) -> Goal:
     """What a config asks for; ``metrics`` measure an episode against it."""
+    return _goal(config, resolve_scene(config)[0])
+
+
+def _goal(config: RunConfig, scene: SceneSpec) -> Goal:
     si, terrain = in_si(config, get_robot(config.robot).params), config.terrain
     heights = [gait_setting(si, one.name, "body_height") for one in build_gaits(config)]
     return Goal(
-        scene=resolve_scene(config)[0],
+        scene=scene,
         duration=config.duration,
         command=build_command(config.command),
         gait_times=np.asarray(config.gait.times, float),
