@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     save(path, plain)
     print(f"trained for prediction ({time.perf_counter() - clock:.0f} s)", flush=True)
     config = short(args, path)
-    _, params = resolve(config)
+    params = jax.tree.map(jnp.asarray, resolve(config)[1])  # indexed by what is traced
     train_on = loop.draw_scenarios(config, TRAIN_SEED, args.scenarios)
     costs = costs_of(params, loop.build_loop(config, memory=MEMORY))
     both, how_both = train(args, data, lambda model: args.weight * costs(model, train_on).mean())
