@@ -1,7 +1,7 @@
 """Files that a config names: results depend on their content."""
 
 import hashlib
-import sys
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ FILE_KEYS = ("koopman.file",)
 def file_hashes(config: Any) -> dict[str, str]:
     """Hash of the content of every file that a config names: key -> hash; of none, "none".
 
-    Of a robot of one's own: of its module and its MJCF.
+    Of a robot or a kind of model of one's own: of its module, the robot's MJCF included. What such
+    a module imports in its turn is not seen.
     """
     hashes = {}
     for key in FILE_KEYS:
@@ -24,12 +25,22 @@ def file_hashes(config: Any) -> dict[str, str]:
         if file:
             path = resolve(file)
             hashes[key] = _hash(path.read_bytes()) if path.is_file() else "none"
-    name = getattr(config, "robot", "")
-    if ":" in name:
-        mjcf = get_robot(name).mjcf.read_bytes()
-        source = getattr(sys.modules[name.partition(":")[0]], "__file__", None)
-        hashes["robot"] = _hash(mjcf + (Path(source).read_bytes() if source else b""))
+    robot = getattr(config, "robot", "")
+    if ":" in robot:
+        hashes["robot"] = own_module_hash(robot, get_robot(robot).mjcf.read_bytes())
+    model = getattr(getattr(config, "koopman", None), "model", "")
+    if ":" in model:
+        hashes["koopman.model"] = own_module_hash(model)
     return hashes
+
+
+def own_module_hash(name: str, more: bytes = b"") -> str:
+    """Hash of the source of the module in ``"module:NAME"``; of kjax's own, "kjax"."""
+    if ":" not in name:
+        return "kjax"
+    module = importlib.import_module(name.partition(":")[0])
+    source = getattr(module, "__file__", None)
+    return _hash(more + (Path(source).read_bytes() if source else b""))
 
 
 def _hash(content: bytes) -> str:

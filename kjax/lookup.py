@@ -30,7 +30,8 @@ def look_up(key: str, name: str, known: Mapping[str, str], wanted: type) -> Any:
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"{key}: '{name}' cannot be loaded: {error}") from None
+        path = "; is its folder in PYTHONPATH?" if isinstance(error, ModuleNotFoundError) else ""
+        raise ValueError(f"{key}: '{name}' cannot be loaded: {error}{path}") from None
     if not isinstance(found, wanted):
         raise ValueError(f"{key}: '{name}' is a {type(found).__name__}, wanted a {wanted.__name__}")
     return found

@@ -29,7 +29,7 @@ from kjax.robots import get_robot  # noqa: E402
 from kjax.types import MODE_ALPHA, Mode  # noqa: E402
 
 DT, STEPS = 1e-3, 200
-body = own_body(SrbConfig(), get_robot().params)
+body = jax.tree.map(jnp.asarray, own_body(SrbConfig(), get_robot().params))
 alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
 ranges = sample_ranges(DatasetSpec())
 data = jax.jit(lambda k: sample(k, body, alpha, ranges, rollouts=100, steps=100, dt=DT))(

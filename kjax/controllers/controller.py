@@ -7,7 +7,6 @@ under ``vmap`` alike. The caller owns ``jit``.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -83,10 +82,24 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
     if not isinstance(spec, ControllerSpec):
         raise TypeError(f"spec: wanted that of kjax.resolve, got {type(spec).__name__}")
     base = build_base(spec.base)
-    init_from = partial(_init_from, spec)
-    plan_from = partial(_plan_from, spec, build_planner(spec) if planner is None else planner)
-    plan = partial(_plan, base, plan_from)
+    plan_forces = build_planner(spec) if planner is None else planner
     act = build_act(base, spec.act_dt)
+
+    def init(tables: Tables, observation: Observation) -> ControllerState:
+        return _init(base, init_from, tables, observation)
+
+    def init_from(tables: Tables, view: View, track: Array | None = None) -> ControllerState:
+        return _init_from(spec, tables, view, track)
+
+    def plan(
+        tables: Tables, state: ControllerState, observation: Observation
+    ) -> tuple[ControllerState, PlanInfo]:
+        return _plan(base, plan_from, tables, state, observation)
+
+    def plan_from(
+        tables: Tables, state: ControllerState, view: View, flags: Array, valid: Array
+    ) -> tuple[ControllerState, PlanInfo]:
+        return _plan_from(spec, plan_forces, tables, state, view, flags, valid)
 
     def step(
         tables: Tables, state: ControllerState, observation: Observation
@@ -96,7 +109,7 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         return state, command, info
 
     return Controller(
-        init=partial(_init, base, init_from),
+        init=init,
         plan=plan,
         act=act,
         step=step,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.koopman.observables import STATE_ROWS
@@ -42,20 +43,23 @@ class BilinearModel(NamedTuple):
     B_feet: Float[Array, "4 N 4"]
 
     def step(
-        self, z: Float[Array, "N"], u: Float[Array, "4"], feet: Float[Array, "2 2"]
+        self, z: Float[Array, "N"], u: Float[Array, "4"], feet: Float[Array | np.ndarray, "2 2"]
     ) -> Float[Array, "N"]:
         """Lifted state one step later."""
         response = self.A @ z + jnp.einsum("inm,i,m->n", self.B, z, u)
         return response + jnp.einsum("k,knm,m->n", feet.reshape(4), self.B_feet, u)
 
 
-def input_map(model: LinearModel, feet: Float[Array, "2 2"]) -> Float[Array, "N 4"]:
+def input_map(model: LinearModel, feet: Float[Array | np.ndarray, "2 2"]) -> Float[Array, "N 4"]:
     """B(r) for contact points ``feet`` (2, 2), body frame [m]."""
     return model.B + jnp.tensordot(feet.reshape(4), model.B_feet, axes=1)
 
 
 def step(
-    model: LinearModel, z: Float[Array, "N"], u: Float[Array, "4"], feet: Float[Array, "2 2"]
+    model: LinearModel,
+    z: Float[Array, "N"],
+    u: Float[Array, "4"],
+    feet: Float[Array | np.ndarray, "2 2"],
 ) -> Float[Array, "N"]:
     """Lifted state one step later (the paper's K Pi-hat)."""
     return model.A @ z + input_map(model, feet) @ u
@@ -65,7 +69,7 @@ def rollout(
     model: LinearModel,
     z0: Float[Array, "N"],
     inputs: Float[Array, "steps 4"],
-    feet: Float[Array, "2 2"],
+    feet: Float[Array | np.ndarray, "2 2"],
 ) -> Float[Array, "steps_plus_1 6"]:
     """Predicted states (steps + 1, 6) from a lifted initial state; no re-lifting on the way."""
     B = input_map(model, feet)

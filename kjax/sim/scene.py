@@ -1,6 +1,7 @@
 """The scene: robot, base, ground and physics options, assembled with MjSpec."""
 
 from functools import lru_cache
+from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -34,7 +35,7 @@ def build_spec(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoco
             f"scene: wanted the SceneSpec of kjax.sim.resolve.resolve_scene(config), got "
             f"{type(scene).__name__}"
         )
-    spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
+    spec = _robot_spec(robot)
     spec.option.timestep = scene.sim_dt
     spec.option.cone = _CONES[scene.cone]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -61,7 +62,7 @@ def build_model(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoc
 @lru_cache(maxsize=16)
 def robot_addresses(robot: Robot, base: Literal["planar", "free"]) -> Addresses:
     """Where recorded positions of a robot on a base hold what, whatever the scene is."""
-    spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
+    spec = _robot_spec(robot)
     _add_base(spec, robot.trunk, base)
     return find_addresses(robot, spec.compile())
 
@@ -77,6 +78,18 @@ def apply_world(robot: Robot, model: mujoco.MjModel, world: World) -> None:
     model.geom_pos[model.geom("ground").id, 2] = world.ground
     # Computes what follows from the mass as well.
     place(model, world.obstacles)
+
+
+def _robot_spec(robot: Robot) -> mujoco.MjSpec:
+    """The robot alone; meshes and textures are found beside an MJCF that is a file."""
+    if isinstance(robot.mjcf, Path):
+        spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+    else:
+        spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
+    if spec.body(robot.trunk) is None:
+        names = ", ".join(body.name for body in spec.bodies)
+        raise ValueError(f"robot '{robot.name}': no body named '{robot.trunk}', there are {names}")
+    return spec
 
 
 def _add_base(spec: mujoco.MjSpec, body: str, base: str) -> None:

@@ -166,7 +166,7 @@ def test_a_robot_that_is_none_is_refused(name, text):
 
 
 def test_every_robot_of_kjax_loads():
-    assert robot_names() == ["go1"]
+    assert "go1" in robot_names()
     for name in robot_names():
         assert isinstance(get_robot(name), Robot)
         assert get_robot(name).name == name

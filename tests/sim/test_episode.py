@@ -83,3 +83,22 @@ def test_the_goal_of_an_episode_is_that_of_its_config(episode):
     assert goal.scene == episode.goal.scene == episode.spec.scene
     np.testing.assert_array_equal(goal.heights, episode.controller.height)
     assert episode.ticks == 4
+
+
+MESH = """v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"""
+
+
+def test_a_robots_meshes_are_found_beside_its_mjcf(tmp_path):
+    text = go1.MJCF.read_text(encoding="utf-8")
+    text = text.replace("<worldbody>", '<asset><mesh name="m" file="m.obj"/></asset><worldbody>', 1)
+    (tmp_path / "robot.xml").write_text(text)
+    (tmp_path / "m.obj").write_text(MESH)
+    robot = dataclasses.replace(go1.ROBOT, mjcf=tmp_path / "robot.xml")
+    scene = resolve_episode(load_config(RunConfig, None, SHORT)).spec.scene
+    assert build_model(robot, scene).nmesh == 1
+
+
+def test_a_trunk_that_there_is_not_is_named(episode):
+    robot = dataclasses.replace(go1.ROBOT, trunk="torso")
+    with pytest.raises(ValueError, match=r"robot 'go1': no body named 'torso', there are .*trunk"):
+        build_model(robot, episode.spec.scene)

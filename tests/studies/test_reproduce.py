@@ -7,8 +7,8 @@ import pytest
 
 from kjax.gait import Gait, phases
 from kjax.runs.cache import Cache
-from kjax.sim.episode import metrics
-from kjax.sim.resolve import batch_spec
+from kjax.sim.metrics import metrics
+from kjax.sim.resolve import batch_spec, resolve_goal
 from kjax.studies.reproduce import page, paper_results
 from kjax.studies.reproduce import study as reproduce
 
@@ -144,7 +144,7 @@ def episodes(monkeypatch, standing_run):
         run = standing_run(config, config.duration)
         path.parent.mkdir(parents=True, exist_ok=True)
         record(run, path)
-        return metrics(run, config)
+        return metrics(run, resolve_goal(config))
 
     monkeypatch.setattr("kjax.runs.pool._episode", episode)
     return log

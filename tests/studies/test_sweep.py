@@ -90,18 +90,19 @@ def engine(monkeypatch):
     log = SimpleNamespace(chunks=[], stop_at=None)
 
     class Engine:
-        def run(self, configs, on_progress):
+        def run(self, episodes, on_progress):
             if len(log.chunks) == log.stop_at:
                 raise KeyboardInterrupt
-            log.chunks.append([config.seed for config in configs])
+            seeds = [int(one.params.seed) for one in episodes]
+            speeds = [float(one.goal.command.values[0, 0]) for one in episodes]
+            log.chunks.append(seeds)
             rows = [
-                {"fell": config.seed == 0 and config.command.v_x[0] > 0.2,
-                 "velocity_rmse_mps": config.command.v_x[0]}
-                for config in configs
-            ]  # fmt: skip
+                {"fell": seed == 0 and speed > 0.2, "velocity_rmse_mps": speed}
+                for seed, speed in zip(seeds, speeds, strict=True)
+            ]
             return SimpleNamespace(interrupted=False, metrics=lambda: iter(rows))
 
-    monkeypatch.setattr(runner, "build_engine", lambda sweep, config, threads: Engine())
+    monkeypatch.setattr(runner, "build_engine", lambda sweep, spec, threads: Engine())
     return log
 
 

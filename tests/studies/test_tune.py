@@ -136,10 +136,10 @@ def evolution(monkeypatch, repository, tmp_path):
     log = SimpleNamespace(asked=[], stop_at=None)
 
     class Engine:
-        def __init__(self, config, torques):
+        def __init__(self, spec, torques):
             assert torques == "held"
 
-        def run(self, configs):
+        def run(self, configs):  # not resolved, see below
             if len(log.asked) == log.stop_at:
                 return SimpleNamespace(interrupted=True)
             log.asked.append([one.lmpc.Q for one in configs])
@@ -150,6 +150,7 @@ def evolution(monkeypatch, repository, tmp_path):
         return ((weights - np.log(config.lmpc.Q)) ** 2).sum(axis=1)
 
     monkeypatch.setattr(study, "BatchEngine", Engine)
+    monkeypatch.setattr(study, "resolve_episodes", list)
     monkeypatch.setattr(study, "recording_costs", costs)
     args = SimpleNamespace(speeds=(0.0, 0.3), seconds=0.2, pieces=2)
     begin = study.worsened(space, 2.0, 0)

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.colors import to_rgba
 
 from kjax.config import RunConfig, load_config
+from kjax.sim.resolve import resolve_field
 from kjax.sim.series import Series
 from kjax.sim.terrain import generate
 from kjax.viz import report
@@ -104,7 +105,7 @@ def test_terrain_is_drawn_over_the_way_with_the_field_of_the_first_run(drawn, ru
         (line,) = by_colour(axis, BLUE)
         np.testing.assert_array_equal(line.get_xdata(), runs[0].x[:, 0])
         np.testing.assert_array_equal(line.get_ydata(), values)
-    expected = generate(config.terrain, config.sim.friction)
+    expected = generate(resolve_field(config))
     assert len(field.patches) == len(expected.pos) == 4
     for patch, pos, size in zip(field.patches, expected.pos, expected.size, strict=True):
         low, high = patch.get_path().get_extents().get_points()

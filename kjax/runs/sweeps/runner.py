@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dict
+from kjax.files import own_module_hash
 from kjax.runs.cache import Cache, lock
 from kjax.runs.sweeps.dataset import merged, write
 from kjax.runs.sweeps.grid import plan
@@ -117,7 +118,7 @@ def run_sweep(
 
 def _keys(cache: Cache, sweep: SweepConfig, cases: Sequence[RunConfig]) -> list[str]:
     """Key of each case's result."""
-    how = [sweep.engine, sweep.torques, sweep.precision]
+    how = [sweep.engine, own_module_hash(sweep.engine), sweep.torques, sweep.precision]
     keys = {config: cache.key(config, "sweep", how) for config in dict.fromkeys(cases)}
     return [keys[config] for config in cases]
 

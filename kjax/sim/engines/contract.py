@@ -62,6 +62,9 @@ def get_engine(name: str) -> type[Engine]:
     modules = sorted(one.name for one in pkgutil.iter_modules(package.__path__))
     known = {one: f"{package.__name__}.{one}:ENGINE" for one in modules if one != "contract"}
     engine: type[Engine] = look_up("engine", name, known, type)
+    missing = [one for one in ("run", "check") if not callable(getattr(engine, one, None))]
+    if missing:
+        raise ValueError(f"engine: '{name}' has no {missing[0]}; see {__name__}.Engine")
     return engine
 
 

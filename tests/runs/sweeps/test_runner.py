@@ -239,12 +239,15 @@ from kjax.runs.sweeps import runner
 from kjax.studies.sweep import main
 
 class Engine:
-    def run(self, configs, on_progress):
+    def run(self, episodes, on_progress):
         time.sleep(0.1)
-        rows = [{"fell": False, "velocity_rmse_mps": c.seed + c.command.v_x[0]} for c in configs]
+        rows = [
+            {"fell": False, "velocity_rmse_mps": int(e.params.seed) + e.goal.command.values[0, 0]}
+            for e in episodes
+        ]
         return SimpleNamespace(interrupted=False, metrics=lambda: iter(rows))
 
-runner.build_engine = lambda sweep, config, threads: Engine()
+runner.build_engine = lambda sweep, spec, threads: Engine()
 if __name__ == "__main__":
     cli.run(main)
 """
