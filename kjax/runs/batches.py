@@ -48,6 +48,8 @@ def run_batch(
 ) -> list[dict[str, Any]]:
     """Metrics of the episodes, in order; what the cache holds is not run again.
 
+    Ten arguments: what is run and where it is kept, and options by keyword.
+
     Args:
       cache: of results.
       configs: of the robots, with one ``sim.resolve.batch_spec`` and one duration.

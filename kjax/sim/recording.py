@@ -113,7 +113,10 @@ def recording_of_ticks(
     wall_time: float,
     interrupted: bool,
 ) -> Recording:
-    """A batch's recording, sampled at the beginning of each control tick of ``dt``."""
+    """A batch's recording, sampled at the beginning of each control tick of ``dt``.
+
+    Ten arguments: the fields of ``Recording`` that engines differ in, by keyword.
+    """
     none = np.zeros((0, len(ticks)))
     return Recording(
         episodes=list(episodes),

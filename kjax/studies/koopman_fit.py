@@ -50,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def fit_study(config: FitStudyConfig) -> tuple[dict[str, Any], dict[str, Any]]:
     """Fit on the config's ranges and test; then again on each of its smaller ranges.
 
+    In one piece of 65 lines, since what is compiled closes over what is set up before it.
+
     Returns:
       ``fit`` per mode, ``error_at_end`` per mode, statistic and state, and
       ``largest_scale_within_tolerance`` per mode and statistic; and per mode the statistics over

@@ -84,7 +84,7 @@ def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: st
             peak = np.abs(run.torque[part, :, joint]).max(axis=1)
             torque.plot(t[part], peak, color=(GREY, BLUE, RED)[joint], label=name)
         torque.set_ylabel("largest |torque|\nof the legs [N m]")
-        torque.legend(ncol=3, loc="upper right")
+        _legend_above(torque)
         gait_bars(bars, run, config.sim.contact_threshold, part)
         for axis in (force, torque, bars):
             axis.set_xlim(start, stop)
@@ -117,8 +117,8 @@ def zoom_window(end: float, config: RunConfig) -> tuple[float, float]:
 def _legend_above(axis: Axes) -> None:
     """A legend in one row, with room of its own above the curves."""
     low, high = axis.get_ylim()
-    axis.set_ylim(low, high + 0.18 * (high - low))
-    axis.legend(ncol=3, loc="upper left")
+    axis.set_ylim(low, high + 0.22 * (high - low))
+    axis.legend(ncol=4, loc="upper left")
 
 
 def _forces(axis: Axes, run: Trajectory, part: np.ndarray) -> None:
@@ -126,7 +126,7 @@ def _forces(axis: Axes, run: Trajectory, part: np.ndarray) -> None:
         axis.plot(run.time[part], run.force[part, leg, 2], color=_LEG_COLOURS[leg], label=leg.name)
         axis.plot(run.time[part], run.force[part, leg, 0], ":", color=_LEG_COLOURS[leg])
     axis.set_ylabel("planned force [N]\nF_z, dotted F_x")
-    axis.legend(ncol=4, loc="upper right")
+    _legend_above(axis)
 
 
 def gait_bars(axis: Axes, run: Trajectory | Series, threshold: float, part: np.ndarray) -> None:

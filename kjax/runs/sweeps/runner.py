@@ -62,6 +62,8 @@ def run_sweep(
 ) -> xr.Dataset | None:
     """Run what is missing of a sweep, and merge it.
 
+    Eight arguments: a sweep and its folder, and how processes share it by keyword.
+
     Args:
       sweep: its config.
       file: that it came from.
