@@ -126,9 +126,11 @@ def test_other_arrays_are_no_model(tmp_path):
 def test_a_file_cut_off_anywhere_is_refused(tmp_path):
     whole = storage.save(tmp_path / "whole.npz", residual()).read_bytes()
     path = tmp_path / "model.npz"
-    for length in range(0, len(whole), len(whole) // 40):
+    lengths = range(0, len(whole), len(whole) // 40)
+    assert len(lengths) >= 40
+    for length in lengths:
         path.write_bytes(whole[:length])
-        refusal(path)
+        assert refusal(path).startswith("file: "), length  # see there what else is asserted
 
 
 @pytest.mark.parametrize(("stored", "family"), [(residual(), "residual"), (learned(), "learned")])
