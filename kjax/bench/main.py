@@ -10,6 +10,8 @@ edmd: fits beside pykoopman and pykoop, the drawing of their data beside NumPy, 
 stream; --peers names a Python that has the two.
 gradient: gradients of a closed loop of 1 s on the rigid body, 200 QPs, against differences; time
 and memory for 256 scenarios.
+device: what a GPU gains: controllers, QPs, data and fits, closed loops on MJX, on each kind of
+device of this machine.
 """
 
 import importlib
@@ -27,6 +29,7 @@ MODULES = {
     "simulation": "kjax.bench.simulation.benchmark",
     "edmd": "kjax.bench.edmd.benchmark",
     "gradient": "kjax.bench.gradient",
+    "device": "kjax.bench.device",
 }
 BENCHMARKS = ("controller", *MODULES)
 

@@ -1,0 +1,207 @@
+"""What a GPU gains: the batched parts on every kind of device of this machine, in float32.
+
+Each kind of device has a process of its own, since JAX chooses one for all that it compiles. Inputs
+lie on the device, and results are waited for.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kjax import qp
+from kjax.bench.edmd import data as edmd_data
+from kjax.bench.simulation import benchmark as simulation
+from kjax.bench.timing import elapsed
+from kjax.controllers.controller import build_controller
+from kjax.controllers.params import condense
+from kjax.koopman import edmd
+from kjax.robots import get_robot
+from kjax.sim.engines.mujoco import MujocoEngine
+from kjax.sim.episode import initial_state
+from kjax.sim.resolve import resolve_episode
+from kjax.viz.tables import markdown_table
+
+SIZES = {"cpu": (1024, 16384), "gpu": (1024, 16384, 131072)}  # robots, QPs
+MJX_SIZES = {"cpu": (1024,), "gpu": (1024, 4096, 16384)}
+ROUNDS = 5
+VARIABLES = 24  # of the random QPs, as many as the trot's have
+SNAPSHOTS = 10_000_000
+PARTS = ("controller", "qp", "edmd", "mjx")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument(
+        "--parts", nargs="+", choices=PARTS, default=list(PARTS), help="what is measured"
+    )
+
+
+def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """All measurements on each kind of device; leaves figure.png and table.md in the folder."""
+    kinds = ["cpu"] if jax.default_backend() == "cpu" else ["gpu", "cpu"]
+    result: dict[str, Any] = {"devices": {}}
+    for kind in kinds:
+        for part in args.parts:
+            entry = _elsewhere(kind, part, args.quick)
+            print(f"{kind}, {part}: {json.dumps(entry)}", flush=True)
+            result["devices"].setdefault(kind, {}).update(entry)
+    (folder / "table.md").write_text(table(result), encoding="utf-8")
+    figure(result, folder / "figure.png")
+    return result
+
+
+def _elsewhere(kind: str, part: str, quick: bool) -> dict[str, Any]:
+    """One part in a process of its own on one kind of device."""
+    code = (
+        "import json\n"
+        "from kjax import cli; cli.configure_jax(parallel=True)\n"
+        "import jax; jax.config.update('jax_enable_x64', False)\n"
+        "from kjax.bench import device\n"
+        f"print('RESULT' + json.dumps(device.measure({kind!r}, {part!r}, {quick})))\n"
+    )
+    environment = dict(os.environ, JAX_PLATFORMS="cpu") if kind == "cpu" else dict(os.environ)
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment
+    )
+    before, found, result = done.stdout.rpartition("RESULT")
+    print(before, end="", flush=True)
+    if done.returncode or not found:
+        return {part: {"failed": f"exit code {done.returncode}"}}
+    return json.loads(result)
+
+
+def measure(kind: str, part: str, quick: bool) -> dict[str, Any]:
+    """One part on the device of this process."""
+    sizes = SIZES[kind][:1] if quick else SIZES[kind]
+    named = {"name": jax.devices()[0].device_kind, "cores": os.cpu_count()}
+    if part == "mjx":
+        walks = MJX_SIZES[kind][:1] if quick else MJX_SIZES[kind]
+        entries = {str(n): simulation.mjx_batch(n, 2) for n in walks}
+        return named | {"mjx": entries}
+    if part == "edmd":
+        return named | {"edmd": data_and_fit(SNAPSHOTS // (100 if quick else 1))}
+    one = {"controller": controller, "qp": box_qps}[part]
+    return named | {part: {str(n): one(n) for n in sizes}}
+
+
+def _rate(call: Callable[[], Any], per_call: int) -> dict[str, float]:
+    """Calls once to compile, and then ``ROUNDS`` times: items per second by the median."""
+    first = elapsed(call)
+    seconds = float(np.median([elapsed(call) for _ in range(ROUNDS)]))
+    return {"per_s": per_call / seconds, "seconds": seconds, "compile_s": first - seconds}
+
+
+def controller(robots: int) -> dict[str, float]:
+    """Control ticks per second: one plan and the joint torques of its five samples, per robot."""
+    config = simulation.cases("trot", 1, 1.0)[0]
+    episode = resolve_episode(config)
+    engine = MujocoEngine(episode.spec)
+    qpos, qvel = initial_state(episode.start, engine.model, engine.addresses)
+    standing = engine.observe(qpos, qvel, np.zeros(engine.model.nsensordata))
+    control = build_controller(episode.spec.controller)
+    tables = condense(episode.spec.controller, episode.controller, dtype=np.float32)
+
+    def tick(state: Any, observation: Any) -> Any:
+        state, _ = control.plan(tables, state, observation)
+
+        def act(state: Any, _: None) -> Any:
+            state, joints = control.act(tables, state, observation)
+            return state, joints.torque
+
+        return jax.lax.scan(act, state, None, length=episode.spec.per_tick)
+
+    key = jax.random.key(0)
+
+    def noisy(leaf: Any) -> Any:
+        leaf = jnp.broadcast_to(jnp.asarray(leaf), (robots, *np.shape(leaf)))
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return leaf
+        return leaf.astype(jnp.float32) + 0.003 * jax.random.normal(key, leaf.shape)
+
+    observations = jax.tree.map(noisy, standing)
+    start = jax.jit(jax.vmap(lambda seen: control.init(tables, seen)))(observations)
+    many = jax.jit(jax.vmap(tick))
+    return _rate(lambda: many(start, observations), robots)
+
+
+def box_qps(count: int) -> dict[str, float]:
+    """Box QPs per second, each with a Hessian of its own, and the share that is solved."""
+    keys = jax.random.split(jax.random.key(1), 2)
+    root = jax.random.normal(keys[0], (count, VARIABLES, VARIABLES)) / VARIABLES**0.5
+    H = jnp.einsum("bij,bkj->bik", root, root) + 0.1 * jnp.eye(VARIABLES)
+    q = jax.random.normal(keys[1], (count, VARIABLES))
+    lower, upper = jnp.full((count, VARIABLES), -0.5), jnp.full((count, VARIABLES), 0.5)
+
+    def solve(H: Any, q: Any, lower: Any, upper: Any) -> Any:
+        solution = qp.solve(qp.prepare(H), q, lower, upper)
+        return solution.x, solution.status
+
+    many = jax.jit(jax.vmap(solve))
+    rate = _rate(lambda: many(H, q, lower, upper), count)
+    status = np.asarray(many(H, q, lower, upper)[1])
+    return rate | {"solved": float(np.mean(status == int(qp.Status.SOLVED)))}
+
+
+def data_and_fit(snapshots: int) -> dict[str, Any]:
+    """Snapshots drawn per second (RK4 rollouts), and fitted per second by EDMD."""
+    here = edmd_data.setting()
+    rollouts = snapshots // here.steps
+    draw = edmd_data.sampler(here, rollouts, here.steps)
+    fit = jax.jit(lambda drawn: edmd.fit(edmd_data.PAPER, drawn))
+    count = rollouts * here.steps
+    drawing = _rate(lambda: draw(jax.random.key(0)), count)
+    drawn = draw(jax.random.key(0))
+    return {"snapshots": count, "draw": drawing, "fit": _rate(lambda: fit(drawn), count)}
+
+
+def table(result: dict[str, Any]) -> str:
+    """All of it as Markdown."""
+    rows = []
+    for kind, entry in result["devices"].items():
+        name = f"{kind}: {entry['name']}" if kind != "cpu" else f"cpu, {entry['cores']} cores"
+        for part, unit in (("controller", "ticks"), ("qp", "QPs")):
+            for size, found in entry.get(part, {}).items():
+                if size != "failed":
+                    rows.append((name, f"{part}, batch of {int(size):,}",
+                                 f"{found['per_s']:,.0f} {unit}/s", f"{found['compile_s']:.1f}"))  # fmt: skip
+        for part in ("draw", "fit"):
+            if part in entry.get("edmd", {}):
+                found = entry["edmd"][part]
+                rows.append((name, f"edmd, {part}, {entry['edmd']['snapshots']:,} snapshots",
+                             f"{found['per_s']:,.0f} snapshots/s", f"{found['compile_s']:.1f}"))  # fmt: skip
+        for size, found in entry.get("mjx", {}).items():
+            if size != "failed":
+                rows.append((name, f"MJX trot, {int(size):,} robots ({found['over_bare']:.2f} of bare MJX)",
+                             f"{found['robot_steps_per_s']:,.0f} robot-steps/s", f"{found['compile_s']:.0f}"))  # fmt: skip
+    return markdown_table(("device", "what", "rate", "compile, s"), rows)
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Rates against the size of the batch, a line per device."""
+    fig, axes = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
+    for ax, part, what in zip(
+        axes,
+        ("controller", "qp", "mjx"),
+        ("control ticks/s (plan + 5 act)", "box QPs/s, 24 variables", "MJX robot-steps/s"),
+        strict=True,
+    ):
+        for kind, color in (("gpu", "C2"), ("cpu", "C0")):
+            found = result["devices"].get(kind, {}).get(part, {})
+            points = {int(size): entry for size, entry in found.items() if size != "failed"}
+            rates = [e.get("per_s", e.get("robot_steps_per_s")) for e in points.values()]
+            ax.loglog(list(points), rates, "o-", color=color, label=kind)
+        ax.set(xlabel="batch", title=what)
+    axes[0].legend()
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
