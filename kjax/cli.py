@@ -265,6 +265,7 @@ def configure_jax(
     os.environ.setdefault("NPROC", str(max(8, 4 * (os.cpu_count() or 1))) if parallel else "1")
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+    jax.config.update("jax_default_matmul_precision", "highest")  # MJX's too: no TF32 on a GPU
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = compilation_cache()
         jax.config.update("jax_compilation_cache_dir", None if folder is None else str(folder))

@@ -26,14 +26,14 @@ from kjax.bench.timing import elapsed
 from kjax.controllers.controller import build_controller
 from kjax.controllers.params import condense
 from kjax.koopman import edmd
-from kjax.robots import get_robot
+from kjax.sim.engines.mjx import MjxEngine
 from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
-from kjax.sim.resolve import resolve_episode
+from kjax.sim.resolve import resolve_episode, resolve_episodes
 from kjax.viz.tables import markdown_table
 
 SIZES = {"cpu": (1024, 16384), "gpu": (1024, 16384, 131072)}  # robots, QPs
-MJX_SIZES = {"cpu": (1024,), "gpu": (1024, 4096, 16384)}
+MJX_SIZES = {"cpu": (1024,), "gpu": (1024, 4096, 8192)}
 ROUNDS = 5
 VARIABLES = 24  # of the random QPs, as many as the trot's have
 SNAPSHOTS = 10_000_000
@@ -87,8 +87,7 @@ def measure(kind: str, part: str, quick: bool) -> dict[str, Any]:
     named = {"name": jax.devices()[0].device_kind, "cores": os.cpu_count()}
     if part == "mjx":
         walks = MJX_SIZES[kind][:1] if quick else MJX_SIZES[kind]
-        entries = {str(n): simulation.mjx_batch(n, 2) for n in walks}
-        return named | {"mjx": entries}
+        return named | {"mjx": {str(n): mjx_walks(n) for n in walks}}
     if part == "edmd":
         return named | {"edmd": data_and_fit(SNAPSHOTS // (100 if quick else 1))}
     one = {"controller": controller, "qp": box_qps}[part]
@@ -108,7 +107,8 @@ def controller(robots: int) -> dict[str, float]:
     episode = resolve_episode(config)
     engine = MujocoEngine(episode.spec)
     qpos, qvel = initial_state(episode.start, engine.model, engine.addresses)
-    standing = engine.observe(qpos, qvel, np.zeros(engine.model.nsensordata))
+    sensors = jnp.zeros(engine.model.nsensordata)
+    standing = engine.observe(jnp.asarray(qpos), jnp.asarray(qvel), sensors)
     control = build_controller(episode.spec.controller)
     tables = condense(episode.spec.controller, episode.controller, dtype=np.float32)
 
@@ -130,9 +130,9 @@ def controller(robots: int) -> dict[str, float]:
         return leaf.astype(jnp.float32) + 0.003 * jax.random.normal(key, leaf.shape)
 
     observations = jax.tree.map(noisy, standing)
-    start = jax.jit(jax.vmap(lambda seen: control.init(tables, seen)))(observations)
+    states = jax.jit(jax.vmap(lambda seen: control.init(tables, seen)))(observations)
     many = jax.jit(jax.vmap(tick))
-    return _rate(lambda: many(start, observations), robots)
+    return _rate(lambda: many(states, observations), robots)
 
 
 def box_qps(count: int) -> dict[str, float]:
@@ -165,43 +165,70 @@ def data_and_fit(snapshots: int) -> dict[str, Any]:
     return {"snapshots": count, "draw": drawing, "fit": _rate(lambda: fit(drawn), count)}
 
 
+def mjx_walks(robots: int) -> dict[str, float]:
+    """Closed loops on MJX: robot-steps per second, and what the host does before and after."""
+    episodes = resolve_episodes(simulation.cases("trot", robots, simulation.EPISODE_MJX))
+    engine = MjxEngine(episodes[0].spec)
+    recordings, whole = [], []
+    for _ in range(3):
+        begin = time.perf_counter()
+        recordings.append(engine.run(episodes))
+        whole.append(time.perf_counter() - begin)
+    seconds = float(np.median([one.wall_time for one in recordings[1:]]))
+    steps = round(simulation.EPISODE_MJX / episodes[0].spec.scene.sim_dt)
+    return {
+        "per_s": robots * steps / seconds,
+        "seconds": seconds,
+        "compile_s": recordings[0].wall_time - seconds,
+        "host_s": float(np.median(whole[1:])) - seconds,
+        "falls": int(recordings[-1].fell.sum()),
+    }
+
+
+UNITS = {"controller": "ticks", "qp": "QPs", "mjx": "robot-steps"}
+
+
 def table(result: dict[str, Any]) -> str:
     """All of it as Markdown."""
     rows = []
     for kind, entry in result["devices"].items():
-        name = f"{kind}: {entry['name']}" if kind != "cpu" else f"cpu, {entry['cores']} cores"
-        for part, unit in (("controller", "ticks"), ("qp", "QPs")):
-            for size, found in entry.get(part, {}).items():
-                if size != "failed":
-                    rows.append((name, f"{part}, batch of {int(size):,}",
-                                 f"{found['per_s']:,.0f} {unit}/s", f"{found['compile_s']:.1f}"))  # fmt: skip
+        name = f"{entry['cores']} cores" if kind == "cpu" else entry["name"]
+        lines = [
+            (f"{part}, batch of {int(size):,}", found, UNITS[part])
+            for part in UNITS
+            for size, found in _found(entry, part).items()
+        ]
         for part in ("draw", "fit"):
+            count = entry.get("edmd", {}).get("snapshots", 0)
             if part in entry.get("edmd", {}):
-                found = entry["edmd"][part]
-                rows.append((name, f"edmd, {part}, {entry['edmd']['snapshots']:,} snapshots",
-                             f"{found['per_s']:,.0f} snapshots/s", f"{found['compile_s']:.1f}"))  # fmt: skip
-        for size, found in entry.get("mjx", {}).items():
-            if size != "failed":
-                rows.append((name, f"MJX trot, {int(size):,} robots ({found['over_bare']:.2f} of bare MJX)",
-                             f"{found['robot_steps_per_s']:,.0f} robot-steps/s", f"{found['compile_s']:.0f}"))  # fmt: skip
-    return markdown_table(("device", "what", "rate", "compile, s"), rows)
+                lines.append((f"EDMD, {part} {count:,}", entry["edmd"][part], "snapshots"))
+        rows += [
+            (name, what, f"{found['per_s']:,.0f} {unit}/s", f"{found['compile_s']:.1f}")
+            for what, found, unit in lines
+        ]
+    return markdown_table(("device", "what", "rate", "compilation, s"), rows)
+
+
+def _found(entry: dict[str, Any], part: str) -> dict[str, Any]:
+    """What was measured of a part, by size; nothing if it failed."""
+    return {} if "failed" in entry.get(part, {}) else entry.get(part, {})
 
 
 def figure(result: dict[str, Any], path: Path) -> None:
     """Rates against the size of the batch, a line per device."""
     fig, axes = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
-    for ax, part, what in zip(
-        axes,
-        ("controller", "qp", "mjx"),
-        ("control ticks/s (plan + 5 act)", "box QPs/s, 24 variables", "MJX robot-steps/s"),
-        strict=True,
-    ):
-        for kind, color in (("gpu", "C2"), ("cpu", "C0")):
-            found = result["devices"].get(kind, {}).get(part, {})
-            points = {int(size): entry for size, entry in found.items() if size != "failed"}
-            rates = [e.get("per_s", e.get("robot_steps_per_s")) for e in points.values()]
-            ax.loglog(list(points), rates, "o-", color=color, label=kind)
-        ax.set(xlabel="batch", title=what)
+    titles = {
+        "controller": "control ticks/s (plan + 5 act)",
+        "qp": f"box QPs/s, {VARIABLES} variables",
+        "mjx": "robot-steps/s on MJX",
+    }
+    for ax, (part, title) in zip(axes, titles.items(), strict=True):
+        for kind, entry in result["devices"].items():
+            points = _found(entry, part)
+            name = f"{entry['cores']} cores" if kind == "cpu" else entry["name"]
+            rates = [found["per_s"] for found in points.values()]
+            ax.loglog([int(size) for size in points], rates, "o-", label=name)
+        ax.set(xlabel="batch", title=title)
     axes[0].legend()
     fig.savefig(path, dpi=120)
     plt.close(fig)

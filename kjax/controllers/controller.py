@@ -31,6 +31,7 @@ from kjax.legs import contact, swing
 from kjax.legs.base import Base, View, build_base, to_local
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc.lmpc import start_memory
+from kjax.precision import full_precision
 from kjax.spec import ControllerSpec
 from kjax.types import COMMAND_NAMES, JointCommand, Observation
 
@@ -109,12 +110,12 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         return state, command, info
 
     return Controller(
-        init=init,
-        plan=plan,
-        act=act,
-        step=step,
-        init_from=init_from,
-        plan_from=plan_from,
+        init=full_precision(init),
+        plan=full_precision(plan),
+        act=full_precision(act),
+        step=full_precision(step),
+        init_from=full_precision(init_from),
+        plan_from=full_precision(plan_from),
         control_dt=spec.control_dt,
         act_dt=spec.act_dt,
     )

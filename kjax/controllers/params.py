@@ -14,6 +14,7 @@ from kjax.koopman.models import LinearModel
 from kjax.legs import lateral, swing
 from kjax.mpc import horizon
 from kjax.mpc.lmpc import LmpcTables, ModeSettings, build_tables
+from kjax.precision import full_precision
 from kjax.prediction.build import Prediction
 from kjax.spec import ControllerSpec
 from kjax.types import Command, RobotParams
@@ -103,6 +104,7 @@ class Tables(NamedTuple):
     lmpc: LmpcTables
 
 
+@full_precision
 def condense(spec: ControllerSpec, params: ControllerParams, *, dtype: Any = None) -> Tables:
     """Precompute what depends on the parameters alone.
 
@@ -143,6 +145,7 @@ def with_params(tables: Tables, **changes: Any) -> Tables:
 
 
 @partial(jax.jit, static_argnums=0)
+@full_precision
 def _condensed(spec: ControllerSpec, params: ControllerParams) -> LmpcTables:
     return build_tables(
         params.fits.model,

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from kjax.dynamics import srb_planar
 from kjax.moved import moved_names
+from kjax.precision import full_precision
 from kjax.types import INPUT_DIM, STATE_DIM
 
 _PIECE = 256  # rollouts that are integrated side by side
@@ -103,6 +104,7 @@ def shrink(ranges: SampleRanges, scale: Float[Array, ""]) -> SampleRanges:
     )
 
 
+@full_precision
 def sample(
     key: PRNGKeyArray,
     params: srb_planar.SrbParams,

@@ -29,6 +29,7 @@ from kjax.koopman.observables import (
     monomials,
     paper,
 )
+from kjax.precision import full_precision
 from kjax.spec import DictionarySpec
 from kjax.types import INPUT_DIM, MODE_ALPHA, Mode
 
@@ -103,6 +104,7 @@ def regressors(
     return Z.reshape(-1, Z.shape[-1]), (then - now).reshape(-1, now.shape[-1])
 
 
+@full_precision
 def fit(
     dictionary: Dictionary,
     data: Snapshots,
@@ -145,6 +147,7 @@ def linear_model(W: Float[Array, "columns N"], size: int) -> LinearModel:
     )
 
 
+@full_precision
 def fit_bilinear(
     dictionary: Dictionary,
     data: Snapshots,
@@ -241,6 +244,7 @@ def stack_bodies(
     )
 
 
+@full_precision
 def fit_modes(
     body: srb_planar.SrbParams,
     key: PRNGKeyArray,

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.koopman.observables import STATE_ROWS
+from kjax.precision import full_precision
 
 
 class LinearModel(NamedTuple):
@@ -50,11 +51,13 @@ class BilinearModel(NamedTuple):
         return response + jnp.einsum("k,knm,m->n", feet.reshape(4), self.B_feet, u)
 
 
+@full_precision
 def input_map(model: LinearModel, feet: Float[Array | np.ndarray, "2 2"]) -> Float[Array, "N 4"]:
     """B(r) for contact points ``feet`` (2, 2), body frame [m]."""
     return model.B + jnp.tensordot(feet.reshape(4), model.B_feet, axes=1)
 
 
+@full_precision
 def step(
     model: LinearModel,
     z: Float[Array, "N"],
@@ -65,6 +68,7 @@ def step(
     return model.A @ z + input_map(model, feet) @ u
 
 
+@full_precision
 def rollout(
     model: LinearModel,
     z0: Float[Array, "N"],
@@ -82,6 +86,7 @@ def rollout(
     return jnp.concatenate([z0[STATE_ROWS][None], states])
 
 
+@full_precision
 def aggregate(model: LinearModel, steps: int) -> LinearModel:
     """The same model over ``steps`` of its own steps at once, the input held."""
     if steps < 1:

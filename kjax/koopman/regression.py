@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from kjax.precision import full_precision
+
 BLOCK = 500  # rows factorised at once: they stay in the cache
 ROUNDING = 20.0  # singular values below so many roundings per column count as zero
 
@@ -49,6 +51,7 @@ def empty(columns: int, targets: int, dtype: jnp.dtype | None = None) -> QrFacto
     return QrFactor(R=jnp.zeros((size, size), dtype), rows=jnp.zeros((), dtype))
 
 
+@full_precision
 def accumulate(
     factor: QrFactor,
     Z: Float[Array | np.ndarray, "M c"],
@@ -63,12 +66,14 @@ def accumulate(
     return QrFactor(R=R[: old.shape[0]], rows=forget * factor.rows + new.shape[0])
 
 
+@full_precision
 def merge(one: QrFactor, other: QrFactor) -> QrFactor:
     """The QR factor of the rows of both."""
     R = jnp.linalg.qr(jnp.concatenate([one.R, other.R]), mode="r")
     return QrFactor(R=R, rows=one.rows + other.rows)
 
 
+@full_precision
 def of_rows(Z: Float[Array | np.ndarray, "M c"], Y: Float[Array | np.ndarray, "M t"]) -> QrFactor:
     """The QR factor of M rows, fewer than columns or more."""
     rows = jnp.concatenate([jnp.asarray(Z), jnp.asarray(Y)], axis=1)
@@ -82,6 +87,7 @@ def of_rows(Z: Float[Array | np.ndarray, "M c"], Y: Float[Array | np.ndarray, "M
     return QrFactor(R=R, rows=jnp.asarray(count, R.dtype))
 
 
+@full_precision
 def solve(
     factor: QrFactor,
     columns: int,
@@ -111,6 +117,7 @@ def solve(
     return Weights(W=W, rank=keep.sum(), sigma=sigma)
 
 
+@full_precision
 def rms(factor: QrFactor, W: Float[Array, "c t"]) -> Float[Array, "t"]:
     """Root mean square of Y - Z W over the factor's rows; these need not be those of the fit."""
     move = jnp.concatenate([-W, jnp.eye(W.shape[1], dtype=W.dtype)])

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 from kjax.dynamics import srb_planar
 from kjax.koopman.models import BilinearModel, LinearModel, aggregate, input_map
 from kjax.koopman.observables import STATE_ROWS, Dictionary, states_only
+from kjax.precision import full_precision
 from kjax.types import GRAVITY, STATE_DIM
 
 
@@ -262,6 +263,7 @@ def affine_features(start: Start, x: Array, u: Array) -> Float[Array, "17"]:
     return jnp.concatenate([one, x[2:], u, arm.reshape(4), products.reshape(4)])
 
 
+@full_precision
 def rollout(
     family: Family, params: Any, start: Start, inputs: Float[Array, "steps 4"]
 ) -> Float[Array, "steps_plus_1 6"]:

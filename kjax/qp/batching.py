@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
+from kjax.precision import full_precision
+
 CHUNK = 16  # problems at once; 8 to 32 are alike for 24 variables, all at once is slower
 
 
@@ -17,6 +19,7 @@ def in_chunks(function: Callable[..., Any], chunk: int = CHUNK) -> Callable[...,
     A loop under ``vmap`` runs as long as its slowest member, and a thousand tableaux do not fit in
     a cache. On an accelerator the batch stays whole.
     """
+    function = full_precision(function)  # vmap may trace it after its caller has returned
     whole = custom_vmap(function)
 
     @whole.def_vmap
@@ -51,6 +54,7 @@ def where_needed(
     ``function`` for a batch only if a member needs it, and on a CPU in pieces that hold none but
     the members that do.
     """
+    function = full_precision(function)
 
     @custom_vmap
     def chosen(needed: Array, value: Any, args: Any) -> Any:
@@ -102,6 +106,7 @@ def while_any(
     ``advance`` must leave a finished carry as it is. Under ``vmap`` that saves the comparison of
     old and new that JAX would put around every iteration.
     """
+    advance, unfinished = full_precision(advance), full_precision(unfinished)
 
     @custom_vmap
     def run(carry: Any, args: Any) -> Any:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from kjax.precision import full_precision
 from kjax.qp.batching import in_chunks, where_needed
 from kjax.qp.first_order import FIRST_ORDER, descend
 from kjax.qp.problem import (
@@ -32,6 +33,7 @@ Method = Literal["tableau", "admm", "projected_gradient"]
 METHODS: tuple[Method, ...] = ("tableau", "admm", "projected_gradient")
 
 
+@full_precision
 def solve(
     prepared: Prepared,
     q: Float[Array, "n"],
@@ -120,6 +122,7 @@ def _differentiable(
 
 
 @_differentiable.defjvp
+@full_precision
 def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Solution, Solution]:
     prepared, index, q, lower, upper, _ = primals
     d_prepared, _, dq, d_lower, d_upper, _ = tangents

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from kjax.precision import full_precision
 from kjax.qp.batching import where_needed
 from kjax.qp.box import Method, solve
 from kjax.qp.polish import solve_equations
@@ -72,6 +73,7 @@ class _Qp(NamedTuple):
         return RowData(H, self.q, self.C, low, high)
 
 
+@full_precision
 def solve_rows_from_box(
     prepared: Prepared,
     q: Float[Array, "n"],
@@ -174,6 +176,7 @@ def _solve_whole(
 
 
 @_differentiable.defjvp
+@full_precision
 def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, Any]:
     (qp,), (d_qp,) = primals, tangents
     # An index has no tangent.

@@ -18,6 +18,8 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from kjax.precision import full_precision
+
 
 class Status(IntEnum):
     """Outcome of a solve."""
@@ -140,6 +142,7 @@ class Solution(NamedTuple):
     warm: Warm
 
 
+@full_precision
 def prepare(H: Float[Array, "n n"], fixed: Bool[Array, "n"] | None = None) -> Prepared:
     """Scaling, inverse and spectrum of a Hessian (its symmetric part is used).
 
@@ -214,6 +217,7 @@ def no_tangent(leaf: Array) -> Any:
     return np.zeros(leaf.shape, jax.dtypes.float0)
 
 
+@full_precision
 def kkt_residual(
     H: Float[Array, "n n"],
     q: Float[Array, "n"],

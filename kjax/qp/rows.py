@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from kjax.precision import full_precision
 from kjax.qp.batching import where_needed
 from kjax.qp.certificates import Verdict
 from kjax.qp.polish import solve_equations
@@ -73,6 +74,7 @@ class RowSolution(NamedTuple):
     method: Int[Array, ""]
 
 
+@full_precision
 def solve_rows(
     H: Float[Array, "n n"],
     q: Float[Array, "n"],
@@ -148,6 +150,7 @@ def _differentiable(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSo
 
 
 @_differentiable.defjvp
+@full_precision
 def _derivative(settings: RowSettings, primals: Any, tangents: Any) -> tuple[Any, Any]:
     warm, qp = primals
     _, d_qp = tangents

@@ -1,0 +1,98 @@
+"""No product of matrices is left to a device's default: on a GPU that is TF32."""
+
+from functools import partial
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kjax import Observation, RunConfig, build_controller, condense, load_config, qp, resolve
+from kjax.koopman import edmd, observables
+from kjax.koopman.dataset import Snapshots
+from kjax.legs.posture import stand_pose
+from kjax.qp.batching import CHUNK
+from kjax.robots import go1
+
+EXACT = (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)
+
+
+def products(jaxpr):
+    """Precision of every dot_general of a jaxpr, inner ones included."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation.params["precision"]
+        for inner in jax.extend.core.jaxprs_in_params(equation.params):
+            yield from products(inner)
+
+
+def require_exact(function, *args):
+    found = list(products(jax.make_jaxpr(function)(*args).jaxpr))
+    assert found, "no product at all"
+    assert all(precision == EXACT for precision in found)
+
+
+def test_the_walk_finds_a_product_of_default_precision():
+    with pytest.raises(AssertionError):
+        require_exact(jax.jit(lambda a: a @ a), jnp.eye(3))
+
+
+def standing():
+    height, joints = stand_pose(go1.PARAMS, 0.27)
+    return Observation(
+        base_pos=jnp.array([0.0, 0.0, height]),
+        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
+        base_vel=jnp.zeros(3),
+        base_ang_vel=jnp.zeros(3),
+        joint_pos=jnp.asarray(joints),
+        joint_vel=jnp.zeros((4, 3)),
+        contact=jnp.ones(4, bool),
+    )
+
+
+@pytest.mark.parametrize("base", ["free", "planar"])
+def test_controller(base):
+    spec, params = resolve(load_config(RunConfig, None, {"sim.base": base}))
+    controller, tables = build_controller(spec), condense(spec, params)
+    seen = standing()
+    state = controller.init(tables, seen)
+    require_exact(controller.plan, tables, state, seen)
+    require_exact(controller.act, tables, state, seen)
+    many = jax.tree.map(lambda a: jnp.stack([a] * (2 * CHUNK)), (state, seen))
+    require_exact(jax.vmap(jax.jit(controller.plan), (None, 0, 0)), tables, *many)
+    require_exact(jax.jit(partial(condense, spec)), params)
+
+
+def problem(n=6):
+    root = np.random.default_rng(0).normal(size=(n, n))
+    return root @ root.T + np.eye(n), np.ones(n), -np.ones(n), np.ones(n)
+
+
+@pytest.mark.parametrize("method", qp.METHODS)
+def test_box_and_its_derivative(method):
+    def value(H, q, lower, upper):
+        return qp.solve(qp.prepare(H), q, lower, upper, method=method).x.sum()
+
+    require_exact(value, *problem())
+    require_exact(jax.grad(value), *problem())
+    many = [np.stack([a] * (2 * CHUNK)) for a in problem()]
+    require_exact(jax.vmap(jax.jit(value)), *many)
+    require_exact(jax.vmap(jax.grad(jax.jit(value))), *many)
+
+
+@pytest.mark.parametrize("method", qp.ROW_METHODS)
+def test_rows_and_their_derivative(method):
+    def value(H, q, lower, upper):
+        C, side = jnp.ones((1, len(q))), jnp.ones(1)
+        return qp.solve_rows(H, q, C, -side, side, lower, upper, method=method).x.sum()
+
+    require_exact(value, *problem())
+    many = [np.stack([a] * (2 * CHUNK)) for a in problem()]
+    require_exact(jax.vmap(jax.grad(jax.jit(value))), *many)
+
+
+def test_fit():
+    rng = np.random.default_rng(0)
+    data = Snapshots(rng.normal(size=(40, 6, 6)), rng.normal(size=(40, 5, 4)), np.zeros((40, 2, 2)))
+    require_exact(lambda data: edmd.fit(observables.paper(2), data)[0], data)
