@@ -8,12 +8,12 @@ import jax
 import numpy as np
 import pytest
 
-from kjax import cli
-from kjax.config import ConfigError, RunConfig
+from kjax import cli, options
+from kjax.config import ConfigError
 
 
 def parse(*words):
-    return cli.parse(RunConfig, cli.build_parser(RunConfig, "test"), list(words))
+    return options.parse_config(options.RunOptions, list(words), "test")
 
 
 def refusal(capsys, *words):
@@ -47,14 +47,45 @@ def test_an_unknown_option_is_one_line_with_the_nearest_name(capsys):
     assert "did you mean --lmpc.horizon?" in refusal(capsys, "--lmpc.horizn", "3")
 
 
+def test_words_that_are_missing_or_of_the_wrong_type_are_one_line(capsys):
+    assert "--lmpc.horizon: a value is missing" in refusal(capsys, "--lmpc.horizon")
+    assert "--lmpc.horizon: a value is missing" in refusal(capsys, "--lmpc.horizon", "--seed", "1")
+    assert "lmpc.horizon" in refusal(capsys, "--lmpc.horizon", "many")
+    assert "--out" in refusal(capsys, "--out")
+    assert "unknown option --viedo" in refusal(capsys, "--viedo")
+
+
+def test_a_shipped_config_is_found_by_its_name_and_may_stand_behind_its_keys():
+    assert parse("bound_rough")[0].gait.names == ("bound_multiphase",)
+    config, args = parse("--lmpc.horizon", "10", "trot_velocity", "--duration=3")
+    assert (config.lmpc.horizon, config.duration, args.config) == (10, 3.0, "trot_velocity")
+
+
+def test_a_file_of_ones_own_comes_before_a_shipped_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "trot_velocity").write_text("duration = 1.5")
+    assert parse("trot_velocity")[0].duration == 1.5
+
+
 def test_a_bad_value_is_one_line(capsys):
     assert "greater than 0" in refusal(capsys, "--lmpc.horizon", "0")
     assert "no such file" in refusal(capsys, "configs/nowhere.toml")
 
 
-def test_help_shows_every_key_with_type_unit_and_default(capsys):
-    with pytest.raises(SystemExit):
+def test_help_is_a_screen_and_leads_to_the_keys(capsys):
+    with pytest.raises(SystemExit) as caught:
         parse("--help")
+    assert caught.value.code in (0, None)
+    text = capsys.readouterr().out
+    assert len(text.splitlines()) <= 24
+    assert "--help-config" in text
+    assert "--out PATH" in text
+
+
+def test_every_key_is_shown_with_type_unit_and_default(capsys):
+    with pytest.raises(SystemExit) as caught:
+        parse("--help-config")
+    assert caught.value.code == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "--lmpc.control_dt FLOAT Time between two plans [s]. default: 0.005" in text
     assert "--gaits.trot.switch_rule {anywhere,first_flight,cycle_end} When it may be left" in text
@@ -160,15 +191,15 @@ def test_what_cannot_walk_is_one_line_before_anything_is_compiled(capsys, words,
 
 def test_an_option_out_of_range_is_one_line_and_one_that_was_not_given_passes(capsys):
     args = Namespace(seeds=0, held_out=0.0, threads=None, weight=float("nan"), updates=3)
-    cli.require(args, "threads", "updates", least=1)
-    cli.require(args, "threads", "updates", above=0)
+    options.require(args, "threads", "updates", least=1)
+    options.require(args, "threads", "updates", above=0)
     for name, limit, said in (
         ("seeds", {"least": 1}, "error: --seeds: got 0, wanted at least 1\n"),
         ("held_out", {"above": 0}, "error: --held-out: got 0.0, wanted more than 0\n"),
         ("weight", {"above": 0}, "error: --weight: got nan, wanted more than 0\n"),
     ):
         with pytest.raises(SystemExit) as caught:
-            cli.require(args, name, **limit)
+            options.require(args, name, **limit)
         assert caught.value.code == 2
         assert capsys.readouterr().err == said
 

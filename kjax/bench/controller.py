@@ -1,6 +1,5 @@
 """Latency of the controller in the single-robot loop, beside its floors; start of the main job."""
 
-import argparse
 import json
 import os
 import subprocess
@@ -15,6 +14,7 @@ import jax
 import mujoco
 import numpy as np
 
+from kjax.bench.options import ControllerOptions
 from kjax.bench.timing import Call, interleaved
 from kjax.config import RunConfig
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
@@ -28,7 +28,7 @@ CALLS = 2000  # timed calls of each function
 EPISODE = 400  # physics steps of the closed loop that the timed inputs are taken from
 
 
-def run(config: RunConfig, args: argparse.Namespace) -> dict[str, Any]:
+def run(config: RunConfig, args: ControllerOptions) -> dict[str, Any]:
     """Latencies of a config's controller and, unless left out, the start-up times; prints them."""
     result = controller_latency(config)
     if not args.no_startup:

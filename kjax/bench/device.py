@@ -4,15 +4,15 @@ Each kind of device has a process of its own, since JAX chooses one for all that
 lie on the device, and results are waited for.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ import numpy as np
 
 from kjax import qp
 from kjax.bench.edmd import data as edmd_data
+from kjax.bench.options import BenchOptions
 from kjax.bench.simulation import benchmark as simulation
 from kjax.bench.timing import elapsed
 from kjax.controllers.controller import build_controller
@@ -37,17 +38,21 @@ MJX_SIZES = {"cpu": (1024,), "gpu": (1024, 4096, 8192)}
 ROUNDS = 5
 VARIABLES = 24  # of the random QPs, as many as the trot's have
 SNAPSHOTS = 10_000_000
-PARTS = ("controller", "qp", "edmd", "mjx")
+PARTS: Final = ("controller", "qp", "edmd", "mjx")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+@dataclass(kw_only=True)
+class DeviceOptions(BenchOptions):
     """Options of this benchmark."""
-    parser.add_argument(
-        "--parts", nargs="+", choices=PARTS, default=list(PARTS), help="what is measured"
-    )
+
+    parts: tuple[Literal["controller", "qp", "edmd", "mjx"], ...] = PARTS
+    """What is measured."""
 
 
-def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+OPTIONS = DeviceOptions
+
+
+def run(folder: Path, args: DeviceOptions) -> dict[str, Any]:
     """All measurements on each kind of device; leaves figure.png and table.md in the folder."""
     kinds = ["cpu"] if jax.default_backend() == "cpu" else ["gpu", "cpu"]
     result: dict[str, Any] = {"devices": {}}

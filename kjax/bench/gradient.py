@@ -1,7 +1,7 @@
 """Gradients through the closed loop: right, finite, at what price; for benchmark.py gradient."""
 
-import argparse
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
+from kjax.bench.options import BenchOptions
 from kjax.bench.timing import interleaved, median_ratio
 from kjax.config import RunConfig, load_config
 from kjax.config.shipped import shipped_config
@@ -62,16 +63,18 @@ ROUNDS = 5
 SECONDS = 1.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of benchmark.py gradient."""
-    parser.add_argument(
-        "--through-flight",
-        action="store_true",
-        help="the horizon through flight as well, on 16 scenarios; minutes to compile",
-    )
+@dataclass(kw_only=True)
+class GradientOptions(BenchOptions):
+    """Options of this benchmark."""
+
+    through_flight: bool = False
+    """The horizon through flight as well, on 16 scenarios; minutes to compile."""
 
 
-def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+OPTIONS = GradientOptions
+
+
+def run(folder: Path, args: GradientOptions) -> dict[str, Any]:
     """All measurements; leaves figure.png and table.md in the folder."""
     count = 16 if args.quick else MANY
     result: dict[str, Any] = {"seconds": SECONDS, "scenarios": count, "cases": {}}

@@ -20,9 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kjax import cli
-from kjax.config import RunConfig
+from kjax.bench.options import BenchOptions, ControllerOptions
+from kjax.options import called, fail, parse, parse_config, program
 
-# Each has ``run(folder, args)``, and ``add_arguments(parser)`` where it has options of its own.
+# Each has ``run(folder, args)``, and ``OPTIONS``, their dataclass, where it has some of its own.
 # They are imported when they are asked for: not everybody has what they need.
 MODULES = {
     "qp": "kjax.bench.qp.benchmark",
@@ -38,23 +39,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line and run one benchmark; exit code 0 if it did."""
     words = list(sys.argv[1:] if argv is None else argv)
     if words and words[0] in ("-h", "--help"):
-        print(f"usage: benchmark.py {{{','.join(BENCHMARKS)}}} [options]\n\n{__doc__}")
+        print(f"usage: {called()} {{{','.join(BENCHMARKS)}}} [options]\n\n{__doc__}")
         return 0
     if not words or words[0] not in BENCHMARKS:
-        cli.fail(f"which benchmark? one of: {', '.join(BENCHMARKS)}")
-    if words[0] == "controller":
-        controller_benchmark(words[1:])
-    else:
-        benchmark(words[0], words[1:])
+        fail(f"which benchmark? one of: {', '.join(BENCHMARKS)}")
+    with program(f"{called()} {words[0]}"):
+        if words[0] == "controller":
+            controller_benchmark(words[1:])
+        else:
+            benchmark(words[0], words[1:])
     return 0
+
+
+def part(name: str) -> str:
+    """What the module's head says of a benchmark."""
+    text = " ".join(__doc__.split())
+    begin = text.index(f" {name}: ") + 1
+    ends = [text.find(f" {other}: ", begin) for other in BENCHMARKS]
+    return text[begin : min((end for end in ends if end > 0), default=len(text))]
 
 
 def controller_benchmark(words: Sequence[str]) -> None:
     """The benchmark that takes the config of a run."""
-    parser = cli.build_parser(RunConfig, __doc__)
-    parser.prog = "benchmark.py controller"
-    parser.add_argument("--no-startup", action="store_true", help="leave out the start-up times")
-    config, args = cli.parse(RunConfig, parser, words)
+    config, args = parse_config(ControllerOptions, words, part("controller"))
     args.out = args.out or Path("results") / "benchmark_controller"
     folder = cli.output_folder(args, "benchmark")
     cli.configure_jax(one_core=True)
@@ -69,12 +76,7 @@ def controller_benchmark(words: Sequence[str]) -> None:
 def benchmark(name: str, words: Sequence[str]) -> None:
     """One of ``MODULES``; leaves metrics.json, table.md and figure.png."""
     module = importlib.import_module(MODULES[name])
-    parser = cli.script_parser(__doc__)
-    parser.prog = f"benchmark.py {name}"
-    parser.add_argument("--quick", action="store_true", help="less of it: to check the script")
-    if hasattr(module, "add_arguments"):
-        module.add_arguments(parser)
-    args = parser.parse_args(words)
+    args = parse(getattr(module, "OPTIONS", BenchOptions), words, part(name))
     args.out = args.out or Path("results") / f"benchmark_{name}"
     folder = cli.output_folder(args, f"benchmark_{name}")
     cli.configure_jax(one_core=name in ("qp", "edmd", "gradient"))

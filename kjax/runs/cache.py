@@ -26,6 +26,7 @@ import numpy as np
 from kjax import cli
 from kjax.config import to_dict
 from kjax.files import file_hashes
+from kjax.options import fail
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _NO_PHYSICS = ("viz", "runs", "bench", "studies", "cli.py")  # what cannot change an episode
@@ -174,7 +175,7 @@ def open_cache(folder: Path, *code: Path, fresh: bool = False) -> Cache:
     try:
         return Cache(folder, *code, fresh=fresh)
     except CacheError as error:
-        cli.fail(str(error))
+        fail(str(error))
 
 
 @contextmanager

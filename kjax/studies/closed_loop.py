@@ -1,4 +1,4 @@
-"""Run the Go1 under the Koopman LMPC in MuJoCo: one run, or one per seed.
+"""Walk under the Koopman LMPC in MuJoCo: one run, or one per seed.
 
 Leaves metrics.json, config.toml, trajectory.npz, figure.png and, if asked for, video.mp4 in the
 output folder. Ctrl-C stops the run and writes what was simulated, but no metrics of it, which would
@@ -6,12 +6,12 @@ read like those of a whole run. With --seeds, runs that are already in the folde
 config, same code) are not repeated; a folder of another config or other code is refused.
 """
 
-import argparse
 import dataclasses
 import sys
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import ConfigError, RunConfig
+from kjax.options import Count, RunOptions, fail, parse_config, require
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
 from kjax.sim.metrics import SETTLE_TIME, metrics
@@ -57,20 +58,31 @@ TABLE = (
 INTERRUPTED = ("interrupted", "simulated_s", "fell", "fall_time_s")
 
 
+@dataclass(kw_only=True)
+class RunCommand(RunOptions):
+    """Options of a run."""
+
+    seeds: Count = None
+    """Run this many seeds, from config key 'seed' on."""
+
+    video: bool = False
+    """Also write video.mp4."""
+
+    view: bool = False
+    """Show the run in MuJoCo's viewer."""
+
+    restart: bool = False
+    """With --seeds: drop the seeds that the folder holds."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line and run."""
-    parser = cli.build_parser(RunConfig, __doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, help="run this many seeds, from config key 'seed' on")
-    parser.add_argument("--video", action="store_true", help="also write video.mp4")
-    parser.add_argument("--view", action="store_true", help="show the run in MuJoCo's viewer")
-    parser.add_argument("--restart", action="store_true",
-                        help="with --seeds: drop the seeds that the folder holds")  # fmt: skip
-    config, args = cli.parse(RunConfig, parser, argv)
-    cli.require(args, "seeds", least=1)
+    config, args = parse_config(RunCommand, argv, __doc__.splitlines()[0])
+    require(args, "seeds", least=1)
     if args.view and args.seeds is not None:
-        cli.fail("--view: shows a single run, leave --seeds out")
+        fail("--view: shows a single run, leave --seeds out")
     if args.restart and args.seeds is None:
-        cli.fail("--restart: belongs to --seeds; a single run always starts afresh")
+        fail("--restart: belongs to --seeds; a single run always starts afresh")
     if args.view:
         require_display()
     cli.configure_jax(one_core=True)
@@ -81,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         simulation = MujocoEngine(batch_spec(config))
         simulation.program(resolve_episode(config))
     except ConfigError as error:
-        cli.fail(str(error))
+        fail(str(error))
     print(f"models fitted, controller compiled: {time.perf_counter() - clock:.1f} s", flush=True)
     run: Trajectory | None
     if cache is None:
@@ -96,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(f"no metrics: the first {SETTLE_TIME} s, from standing, are left out")
         cli.save_json(folder / "metrics.json", result)
     else:
-        run, config = run_seeds(simulation, config, args.seeds, cache, folder)
+        run, config = run_seeds(simulation, config, args.seeds or 1, cache, folder)
     if run is not None:
         save_run(run, config, folder, args)
     if run is not None and run.interrupted:
@@ -106,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def save_run(run: Trajectory, config: RunConfig, folder: Path, args: argparse.Namespace) -> None:
+def save_run(run: Trajectory, config: RunConfig, folder: Path, args: RunCommand) -> None:
     """Write trajectory, config, figure and, if asked for, the video."""
     from kjax.viz.plots import closed_loop_figure
 
@@ -149,13 +161,13 @@ def require_display() -> None:
         import glfw
         import mujoco.viewer
     except ImportError as error:
-        cli.fail(f"--view: no window can be opened here ({error}); try --video")
+        fail(f"--view: no window can be opened here ({error}); try --video")
     if sys.platform == "darwin" and mujoco.viewer._MJPYTHON is None:
-        cli.fail("--view: on macOS start it by mjpython instead of python; or try --video")
+        fail("--view: on macOS start it by mjpython instead of python; or try --video")
     # MuJoCo's viewer ends the process where there is no display, so ask first.
     with warnings.catch_warnings(action="ignore"):
         if not glfw.init():
-            cli.fail("--view: no window can be opened here (no display?); try --video")
+            fail("--view: no window can be opened here (no display?); try --video")
 
 
 def _simulate_in_viewer(simulation: MujocoEngine, config: RunConfig, on_tick: OnTick) -> Trajectory:

@@ -13,18 +13,18 @@ failed already. On two cores a bisection takes about 2 minutes, a map of pushes 
 
 import dataclasses
 import math
-from argparse import Namespace
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, load_config
 from kjax.config.shipped import shipped_config
+from kjax.options import StudyOptions, fail, parse, require
 from kjax.runs.bisection import bisect
 from kjax.runs.cache import open_cache
 from kjax.runs.pool import Run, cached_runner, open_runner
@@ -156,7 +156,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     print(f"{axis.quantity}, {one['title']}: {_shown(one)}", flush=True)
                     _save(folder, found, args)
     except ConfigError as error:
-        cli.fail(str(error))
+        fail(str(error))
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here")
         return 130
@@ -164,26 +164,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> Namespace:
-    return cli.parse_study(
-        argv,
-        __doc__.split("\n\n")[0],
-        NAMES,
-        counts={"seeds": (20, "episodes per point")},
-        base="planar",
-        quick="2 seeds of 1.2 s, coarsely: to check the script",
-        default_out="envelope",
-    )
+@dataclass(kw_only=True)
+class EnvelopeOptions(StudyOptions):
+    """Options of the study."""
+
+    names = NAMES
+
+    seeds: int = 20
+    """Episodes per point."""
+
+    base: Literal["planar", "free", "both"] = "planar"
+    """Of the trunk."""
 
 
-def _config(axis: Axis, base: str, args: Namespace) -> RunConfig:
+def _parse(argv: Sequence[str] | None) -> EnvelopeOptions:
+    args = parse(EnvelopeOptions, argv, __doc__.split("\n\n")[0])
+    require(args, "seeds", least=1)
+    args.out = args.out or Path("results") / "envelope"
+    return args
+
+
+def _config(axis: Axis, base: str, args: EnvelopeOptions) -> RunConfig:
     """Config of an axis, before its value is put in."""
     overrides = {"sim.base": base} | axis.overrides
     config = load_config(RunConfig, shipped_config(axis.config), overrides)
     return dataclasses.replace(config, duration=1.2) if args.quick else config
 
 
-def _search(axis: Axis, base: str, args: Namespace, run: Run) -> dict[str, Any]:
+def _search(axis: Axis, base: str, args: EnvelopeOptions, run: Run) -> dict[str, Any]:
     """Bracket of one axis, and every point that was probed."""
     config = _config(axis, base, args)
     seeds = min(args.seeds, 2) if args.quick else args.seeds
@@ -315,7 +323,7 @@ def _shown(one: dict[str, Any]) -> str:
     return limit
 
 
-def _save(folder: Path, found: dict[str, Any], args: Namespace) -> None:
+def _save(folder: Path, found: dict[str, Any], args: EnvelopeOptions) -> None:
     from kjax.viz.report import envelope_figure
 
     record = {"provenance": cli.provenance(), "quick": args.quick, "share": SHARE}

@@ -16,7 +16,6 @@ in one folder. Everything takes about 20 minutes on two quiet cores.
 """
 
 import dataclasses
-from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ import numpy as np
 from kjax import cli
 from kjax.config import ConfigError, RunConfig, load_config
 from kjax.config.shipped import shipped_config
+from kjax.options import Count, File, Options, fail, parse, require, require_names
 from kjax.runs.batches import batch_key, run_batch
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.intervals import median_interval
@@ -110,7 +110,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here")
         return 130
-    everything = _namespace(args, models=_known(args), gaits=list(GAITS), checks=list(LIMITS))
+    everything = dataclasses.replace(
+        args, models=_known(args), gaits=tuple(GAITS), checks=tuple(LIMITS)
+    )
     found = []
     for part in _parts(everything):
         cells = [config for row in part.configs for config in row]
@@ -128,42 +130,57 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> Namespace:
-    parser = cli.script_parser(__doc__.split("\n\n")[0])
-    parser.add_argument("--models", nargs="+", choices=tuple(ROWS), default=list(ROWS))
-    parser.add_argument("--gaits", nargs="+", choices=tuple(GAITS), default=list(GAITS))
-    parser.add_argument("--checks", nargs="+", choices=tuple(LIMITS), default=list(LIMITS))
-    parser.add_argument("--residual", type=Path, metavar="FILE", help="a residual of "
-                        "whole_body.py: run it in trot as well")  # fmt: skip
-    parser.add_argument("--learned", type=Path, metavar="FILE", help="a model of learn_control.py: "
-                        "run it as well")  # fmt: skip
-    parser.add_argument("--seeds", type=int, default=16, help="of the bound in float64")
-    parser.add_argument("--threads", type=int, default=None, help="one per core by default")
-    parser.add_argument("--quick", action="store_true",
-                        help="2 cells, 2 seeds, 0.8 s: to check the script")  # fmt: skip
-    args = parser.parse_args(argv)
-    cli.require(args, "seeds", "threads", least=1)
+@dataclass(kw_only=True)
+class InvarianceOptions(Options):
+    """Options of the study."""
+
+    models: tuple[str, ...] = tuple(ROWS)
+    """Prediction models."""
+
+    gaits: tuple[str, ...] = tuple(GAITS)
+    """Which of them."""
+
+    checks: tuple[str, ...] = tuple(LIMITS)
+    """What is varied."""
+
+    residual: File = None
+    """File of a residual of whole_body.py: run it in trot as well."""
+
+    learned: File = None
+    """File of a model of learn_control.py: run it as well."""
+
+    seeds: int = 16
+    """Of the bound in float64."""
+
+    threads: Count = None
+    """One per core if left out."""
+
+    quick: bool = False
+    """2 cells, 2 seeds, 0.8 s: to check the script."""
+
+
+def _parse(argv: Sequence[str] | None) -> InvarianceOptions:
+    args = parse(InvarianceOptions, argv, __doc__.split("\n\n")[0])
+    for name, known in (("models", ROWS), ("gaits", GAITS), ("checks", LIMITS)):
+        require_names(args, name, known)
+    require(args, "seeds", "threads", least=1)
     for name in ("residual", "learned"):
         file = getattr(args, name)
         if file is not None and not file.is_file():
-            cli.fail(f"--{name}: no file {file}")
+            fail(f"--{name}: no file {file}")
         if file is not None:
-            args.models.append(name)
+            args.models += (name,)
     if args.quick:
         args.seeds = min(args.seeds, 2)
     return args
 
 
-def _namespace(args: Namespace, **more: Any) -> Namespace:
-    return Namespace(**{**vars(args), **more})
-
-
-def _known(args: Namespace) -> list[str]:
+def _known(args: InvarianceOptions) -> tuple[str, ...]:
     """All models that this call could run."""
-    return [*ROWS, *(name for name in ("residual", "learned") if getattr(args, name) is not None)]
+    return (*ROWS, *(name for name in ("residual", "learned") if getattr(args, name) is not None))
 
 
-def _parts(args: Namespace) -> Iterator[Part]:
+def _parts(args: InvarianceOptions) -> Iterator[Part]:
     """The batches of a call, check by check, so that the first ones are whole early on."""
     for check in args.checks:
         for model in args.models:
@@ -173,10 +190,10 @@ def _parts(args: Namespace) -> Iterator[Part]:
                 try:
                     yield part_of(check, model, gait, args)
                 except ConfigError as error:
-                    cli.fail(f"{model}, {gait}: {error}")
+                    fail(f"{model}, {gait}: {error}")
 
 
-def part_of(check: str, model: str, gait: str, args: Namespace) -> Part:
+def part_of(check: str, model: str, gait: str, args: InvarianceOptions) -> Part:
     """Cells and configs of a check."""
     seeds = 1 if gait != "bound" or check == "heading" else args.seeds
     if check == "float32" and not args.quick:
@@ -201,7 +218,7 @@ def part_of(check: str, model: str, gait: str, args: Namespace) -> Part:
     )
 
 
-def _base(check: str, model: str, gait: str, args: Namespace) -> RunConfig:
+def _base(check: str, model: str, gait: str, args: InvarianceOptions) -> RunConfig:
     file, duration = GAITS[gait]
     keys: dict[str, Any] = {"duration": duration, **STEPS}
     if model in ROWS:

@@ -6,6 +6,7 @@ within the tolerance. Leaves metrics.json, config.toml and figure.png in the out
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from kjax.controllers.resolve_model import koopman_keys, model_choice
 from kjax.controllers.rigid_body import own_body
 from kjax.koopman.dataset import SampleRanges, sample_ranges, shrink
 from kjax.koopman.edmd import build_dictionary, fit_modes, srb_params
+from kjax.options import ConfigName, Options, fail, parse_config
 from kjax.prediction.evaluation import ErrorStatistics, prediction_errors, summarise
 from kjax.robots import get_robot
 from kjax.types import MODE_ALPHA, STATE_NAMES, STATE_UNITS, Mode
@@ -27,17 +29,26 @@ MODES = {"trot": Mode.TROT, "front": Mode.FRONT, "rear": Mode.REAR}
 STATISTICS = ErrorStatistics._fields
 
 
+@dataclass(kw_only=True)
+class FitOptions(Options):
+    """Options of the study."""
+
+    config_type = FitStudyConfig
+
+    config: ConfigName = None
+    """A shipped config's name, such as koopman_fit, or a TOML file; the defaults without it."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line and run the study."""
-    parser = cli.build_parser(FitStudyConfig, __doc__.splitlines()[0])
-    config, args = cli.parse(FitStudyConfig, parser, argv)
+    config, args = parse_config(FitOptions, argv, __doc__.splitlines()[0])
     cli.configure_jax()
     folder = cli.output_folder(args, "koopman_fit")
     try:
         with koopman_keys():
             result, curves = fit_study(config)
     except ValueError as error:
-        cli.fail(str(error))
+        fail(str(error))
     _print(config, result)
 
     save_figure(config, curves, folder / "figure.png")

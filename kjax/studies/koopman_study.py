@@ -6,10 +6,10 @@ as an LMPC uses it (linearised at the start). Leaves metrics.json, details.json 
 table.md and figure.png. With --whole-body, metrics.json holds the residual's two ratios as well.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from kjax.controllers.rigid_body import own_body
 from kjax.dynamics import srb_planar
 from kjax.koopman import edmd, observables
 from kjax.koopman.dataset import SampleRanges, sample
+from kjax.options import File, Options, fail, parse
 from kjax.prediction import evaluation, families, learned
 from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
@@ -46,21 +47,35 @@ RANGES = {
 Fitted = tuple[families.Family, Any, srb_planar.Plant, bool]
 
 
+@dataclass(kw_only=True)
+class KoopmanStudyOptions(Options):
+    """Options of the study."""
+
+    quick: bool = False
+    """Less of it: to check the script."""
+
+    draw: bool = False
+    """Draw a finished study again."""
+
+    no_learned: bool = False
+    """Leave out the networks."""
+
+    seed: int = 1
+    """Of the training data."""
+
+    whole_body: File = None
+    """Folder with results of whole_body.py."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line and run the study."""
-    parser = cli.script_parser(__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="less of it: to check the script")
-    parser.add_argument("--draw", action="store_true", help="draw a finished study again")
-    parser.add_argument("--no-learned", action="store_true", help="leave out the networks")
-    parser.add_argument("--seed", type=int, default=1, help="of the training data")
-    parser.add_argument("--whole-body", type=Path, metavar="DIR", help="results of whole_body.py")
-    args = parser.parse_args(argv)
+    args = parse(KoopmanStudyOptions, argv, __doc__.splitlines()[0])
     residual = {} if args.whole_body is None else residual_ratios(args.whole_body)
     folder = cli.output_folder(args, "koopman_study")
     if args.draw:
         file = folder / "details.json"
         if not file.exists():
-            cli.fail(f"--draw: no study in {folder}")
+            fail(f"--draw: no study in {folder}")
         figure(json.loads(file.read_text(encoding="utf-8")), folder / "figure.png")
         return 0
     cli.configure_jax()
@@ -85,10 +100,10 @@ def residual_ratios(folder: Path) -> dict[str, float]:
         there = json.loads(file.read_text(encoding="utf-8"))
         return {name: float(there[name]) for name in names}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        cli.fail(f"--whole-body: no results of whole_body.py in {file}: {error!r}")
+        fail(f"--whole-body: no results of whole_body.py in {file}: {error!r}")
 
 
-def study(args: argparse.Namespace) -> dict[str, Any]:
+def study(args: KoopmanStudyOptions) -> dict[str, Any]:
     """Errors of all models: ranges -> mode -> model -> statistics against the horizon."""
     body = edmd.srb_params(own_body(SrbConfig(), get_robot().params))
     states, profiles = (10, 10) if args.quick else (STARTS, PROFILES)
@@ -134,7 +149,7 @@ def ranges_of(
 
 
 def fit_all(
-    args: argparse.Namespace, body: srb_planar.SrbParams, alpha: Any, ranges: SampleRanges
+    args: KoopmanStudyOptions, body: srb_planar.SrbParams, alpha: Any, ranges: SampleRanges
 ) -> dict[str, Fitted]:
     """Every model of a contact mode."""
     data = sample(

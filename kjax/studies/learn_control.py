@@ -6,13 +6,13 @@ held-out rollouts, and run held-out scenarios on the rigid body and in MuJoCo. L
 metrics.json, table.md, figure.png and both models (for koopman.file) in the output folder.
 """
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from kjax.controllers.resolve import resolve
 from kjax.controllers.resolve_model import dataset_spec
 from kjax.controllers.rigid_body import own_body
 from kjax.koopman.dataset import sample, sample_ranges
+from kjax.options import Options, parse, require
 from kjax.prediction import families, learned, storage
 from kjax.robots import get_robot
 from kjax.sim.closed_cost import recording_costs
@@ -93,23 +94,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = cli.script_parser(__doc__.splitlines()[0])
-    parser.add_argument("--head", choices=("linear", "bilinear"), default="linear")
-    parser.add_argument("--updates", type=int, default=600, help="of Adam")
-    parser.add_argument(
-        "--rate",
-        type=float,
-        default=3e-3,
-        help="of Adam, in what each parameter moves by itself",
-    )
-    parser.add_argument("--scenarios", type=int, default=4, help="closed loops per update")
-    parser.add_argument("--seconds", type=float, default=0.6, help="length of each")
-    parser.add_argument("--weight", type=float, default=0.1, help="of the closed loops' cost")
-    parser.add_argument("--walks", type=int, default=16, help="seeds in MuJoCo")
-    args = parser.parse_args(argv)
+@dataclass(kw_only=True)
+class LearnOptions(Options):
+    """Options of the study."""
+
+    head: Literal["linear", "bilinear"] = "linear"
+    """Form of the model in its observables."""
+
+    updates: int = 600
+    """Of Adam."""
+
+    rate: float = 3e-3
+    """Of Adam, in what each parameter moves by itself."""
+
+    scenarios: int = 4
+    """Closed loops per update."""
+
+    seconds: float = 0.6
+    """Length of each."""
+
+    weight: float = 0.1
+    """Of the closed loops' cost."""
+
+    walks: int = 16
+    """Seeds in MuJoCo."""
+
+
+def _parse(argv: Sequence[str] | None) -> LearnOptions:
+    args = parse(LearnOptions, argv, __doc__.splitlines()[0])
     names = ("updates", "rate", "scenarios", "seconds", "weight", "walks")
-    cli.require(args, *names, above=0)
+    require(args, *names, above=0)
     return args
 
 
@@ -119,7 +133,7 @@ def run_config(path: Path | None) -> RunConfig:
     return load_config(RunConfig, shipped_config("trot_velocity_long.toml"), own)
 
 
-def short(args: argparse.Namespace, path: Path) -> RunConfig:
+def short(args: LearnOptions, path: Path) -> RunConfig:
     """That of a scenario."""
     command = CommandConfig(times=(0.0,), v_x=(0.0,))
     return dataclasses.replace(run_config(path), duration=args.seconds, command=command)
@@ -135,7 +149,7 @@ def draw(seed: int, rollouts: int) -> Any:
     return jax.jit(one)(jax.random.key(seed), body, alpha, ranges)
 
 
-def train(args: argparse.Namespace, data: Any, extra: Any) -> tuple[Any, learned.Training]:
+def train(args: LearnOptions, data: Any, extra: Any) -> tuple[Any, learned.Training]:
     """A model and how its training went; the same random draws with and without ``extra``."""
     fit = partial(
         learned.train,
@@ -183,7 +197,7 @@ def prediction_errors(model: Any, data: Any) -> jax.Array:
     return jax.vmap(one)(*data)
 
 
-def verdict_of(args: argparse.Namespace, path: Path | None) -> dict[str, Any]:
+def verdict_of(args: LearnOptions, path: Path | None) -> dict[str, Any]:
     """The config's command in MuJoCo."""
     config = run_config(path)
     engine = BatchEngine(batch_spec(config))

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ import numpy as np
 from kjax import cli
 from kjax.config import Gaits, RunConfig, load_config
 from kjax.config.shipped import shipped_config
+from kjax.options import File, Options, fail, parse, require_names
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.intervals import bootstrap
 from kjax.studies.prediction_models import MODELS, residual
@@ -32,20 +34,32 @@ SETS = 32  # weight sets, the config's own among them
 FALL = 10.0  # cost of a fall, in rmse of 1 m/s
 
 
+@dataclass(kw_only=True)
+class ModelWalkOptions(Options):
+    """Options of the study."""
+
+    gaits: tuple[str, ...] = tuple(GAITS)
+    """Which of them."""
+
+    residual: File = None
+    """Folder with results of whole_body.py: run its residuals as well."""
+
+    quick: bool = False
+    """Two models, few sets and seeds: to check the script."""
+
+    draw: bool = False
+    """Draw finished models again."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line and run what is missing."""
-    parser = cli.script_parser(__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="two models, few sets and seeds")
-    parser.add_argument("--residual", type=Path, metavar="DIR", help="results of whole_body.py: "
-                        "run its residuals as well")  # fmt: skip
-    parser.add_argument("--gaits", nargs="+", choices=GAITS, default=list(GAITS))
-    parser.add_argument("--draw", action="store_true", help="draw finished models again")
-    args = parser.parse_args(argv)
+    args = parse(ModelWalkOptions, argv, __doc__.splitlines()[0])
+    require_names(args, "gaits", GAITS)
     folder = cli.output_folder(args, "model_walks")
     if args.draw:
         file = folder / "metrics.json"
         if not file.exists():
-            cli.fail(f"--draw: no metrics.json in {folder}")
+            fail(f"--draw: no metrics.json in {folder}")
         found = json.loads(file.read_text(encoding="utf-8"))["walks"]
         figure(found, folder / "figure.png")
         return 0
@@ -87,7 +101,7 @@ def models_of(gait: str, args: Any) -> dict[str, dict[str, Any]]:
         for end, name in (("", "affine"), ("_clock_history", "clock, last force")):
             file = args.residual / f"residual_{gait}{end}.npz"
             if not file.exists():
-                cli.fail(f"--residual: no {file.name} in {args.residual}")
+                fail(f"--residual: no {file.name} in {args.residual}")
             models[f"planted SRB + residual ({name})"] = residual(str(file.resolve()))
     return models
 

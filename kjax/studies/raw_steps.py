@@ -13,7 +13,6 @@ limits, the one over 200 ms several times as long.
 """
 
 import dataclasses
-from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,6 +26,7 @@ import numpy as np
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig, load_config
 from kjax.config.shipped import shipped_config
+from kjax.options import Count, Options, parse, require, require_names
 from kjax.robots import get_robot
 from kjax.runs.batches import batch_key, run_batch
 from kjax.runs.cache import Cache, open_cache
@@ -121,24 +121,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> Namespace:
-    parser = cli.script_parser(__doc__.split("\n\n")[0])
-    parser.add_argument("--gaits", nargs="+", choices=tuple(GAITS), default=list(GAITS))
-    parser.add_argument("--bases", nargs="+", choices=BASES, default=list(BASES))
-    parser.add_argument("--forces", nargs="+", choices=tuple(FORCES), default=list(FORCES))
-    parser.add_argument("--seeds", type=int, default=64, help="episodes per step")
-    parser.add_argument("--threads", type=int, default=None, help="one per core by default")
-    parser.add_argument("--quick", action="store_true",
-                        help="2 seeds, one step from each speed: to check")  # fmt: skip
-    args = parser.parse_args(argv)
-    cli.require(args, "seeds", "threads", least=1)
+@dataclass(kw_only=True)
+class RawStepOptions(Options):
+    """Options of the study."""
+
+    gaits: tuple[str, ...] = tuple(GAITS)
+    """Which of them."""
+
+    bases: tuple[str, ...] = BASES
+    """Of the trunk."""
+
+    forces: tuple[str, ...] = tuple(FORCES)
+    """How they are limited."""
+
+    seeds: int = 64
+    """Episodes per step."""
+
+    threads: Count = None
+    """One per core if left out."""
+
+    quick: bool = False
+    """2 seeds, one step from each speed: to check the script."""
+
+
+def _parse(argv: Sequence[str] | None) -> RawStepOptions:
+    args = parse(RawStepOptions, argv, __doc__.split("\n\n")[0])
+    for name, known in (("gaits", GAITS), ("bases", BASES), ("forces", FORCES)):
+        require_names(args, name, known)
+    require(args, "seeds", "threads", least=1)
     if args.quick:
         args.seeds = min(args.seeds, 2)
     return args
 
 
 def steps_of(
-    case: Setting, start: float, args: Namespace
+    case: Setting, start: float, args: RawStepOptions
 ) -> Iterator[tuple[float, list[RunConfig]]]:
     """Velocities after a step from ``start``, and the configs of all seeds."""
     earliest, values = STEPS[start]
@@ -185,7 +202,7 @@ def _scene(name: str, base: str, contacts: str) -> tuple[Any, Any]:
     return model, find_addresses(get_robot(name), model)
 
 
-def measured(case: Setting, args: Namespace, cache: Cache) -> list[dict[str, Any]]:
+def measured(case: Setting, args: RawStepOptions, cache: Cache) -> list[dict[str, Any]]:
     """Falls, body contacts and pitch of each step of a finished case."""
     rows = []
     for start in STEPS:
@@ -231,7 +248,7 @@ def _sentence(case: Setting, rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def _finished(cache: Cache, args: Namespace) -> Iterator[dict[str, Any]]:
+def _finished(cache: Cache, args: RawStepOptions) -> Iterator[dict[str, Any]]:
     """Rows of all cases that the folder holds whole, of this code and as many seeds."""
     for forces in FORCES:
         for gait in GAITS:

@@ -7,15 +7,18 @@ finished, it only draws.
 
 import json
 import time
-from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
+from tyro.conf import Positional, arg
 
 from kjax import cli
 from kjax.config import ConfigError, SweepConfig, load_config, to_dict
+from kjax.config.shipped import find_config
+from kjax.options import Count, Options, Text, fail, parse, require
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             fresh=args.restart,
         )
     except (ConfigError, CacheError) as error:
-        cli.fail(str(error))
+        fail(str(error))
     except KeyboardInterrupt:
         print(f"stopped; finished chunks are kept in {folder}/, run again to go on")
         return 130
@@ -55,57 +58,84 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         report(dataset, sweep, folder)
     except ValueError as error:
-        cli.fail(f"{args.config}: {error}")
+        fail(f"{args.config}: {error}")
     print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> tuple[SweepConfig, Namespace]:
+@dataclass(kw_only=True)
+class SweepOptions(Options):
+    """Options of a sweep."""
+
+    config: Annotated[str, Positional, arg(metavar="CONFIG")]
+    """A shipped sweep's name, such as sweeps/trot_rough, or a TOML file of one."""
+
+    engine: Text = None
+    """Instead of the file's: mujoco_batch, mjx, mujoco."""
+
+    torques: Annotated[
+        Literal["every_step", "held"] | None,
+        arg(metavar="{every_step,held}", help_behavior_hint=""),
+    ] = None
+    """Instead of the file's."""
+
+    seeds: Count = None
+    """Episodes per point, instead of the file's."""
+
+    chunk: Count = None
+    """Robots at once, instead of the file's."""
+
+    threads: Count = None
+    """Of the C engine; one per core if left out."""
+
+    restart: bool = False
+    """Drop all results that the folder holds."""
+
+    draw: bool = False
+    """Only draw the sweep.nc of a finished sweep."""
+
+    distributed: bool = False
+    """One of several processes, as Slurm or Open MPI tell."""
+
+    coordinator: Text = None
+    """The same by hand: HOST:PORT of process 0."""
+
+    processes: Count = None
+    """Their number."""
+
+    process: Count = None
+    """Number of this one, from 0 on."""
+
+
+def _parse(argv: Sequence[str] | None) -> tuple[SweepConfig, SweepOptions]:
     """The sweep, with what the command line says instead of its file, and the other options."""
-    parser = cli.script_parser(__doc__.splitlines()[0])
-    parser.add_argument("config", help="TOML file of a sweep, e.g. configs/sweeps/trot_rough.toml")
-    parser.add_argument("--engine", help="instead of the file's: mujoco_batch, mjx, mujoco")
-    parser.add_argument("--torques", choices=("every_step", "held"), help="instead of the file's")
-    parser.add_argument("--seeds", type=int, help="episodes per point, instead of the file's")
-    parser.add_argument("--chunk", type=int, help="robots at once, instead of the file's")
-    parser.add_argument("--threads", type=int, help="of the C engine (default: one per core)")
-    parser.add_argument(
-        "--restart", action="store_true", help="drop all results that the folder holds"
-    )
-    parser.add_argument("--draw", action="store_true",
-                        help="only draw the sweep.nc of a finished sweep")  # fmt: skip
-    parser.add_argument("--distributed", action="store_true",
-                        help="one of several processes, as Slurm or Open MPI tell")  # fmt: skip
-    parser.add_argument("--coordinator", metavar="HOST:PORT",
-                        help="the same by hand: address of process 0")  # fmt: skip
-    parser.add_argument("--processes", type=int, help="their number")
-    parser.add_argument("--process", type=int, help="number of this one, from 0 on")
-    args = parser.parse_args(argv)
-    cli.require(args, "seeds", "chunk", "threads", least=1)
+    args = parse(SweepOptions, argv, __doc__.splitlines()[0])
+    require(args, "seeds", "chunk", "threads", least=1)
     given = {name: getattr(args, name) for name in ("engine", "torques", "seeds", "chunk")}
     try:
+        args.config = str(find_config(args.config))
         sweep = load_config(
             SweepConfig, args.config, {k: v for k, v in given.items() if v is not None}
         )
     except ConfigError as error:
-        cli.fail(str(error))
+        fail(str(error))
     return sweep, args
 
 
-def start_processes(args: Namespace) -> Any:
+def start_processes(args: SweepOptions) -> Any:
     """Join the other processes, if there are any; a barrier for them, or ``None``."""
     by_hand = [args.coordinator, args.processes, args.process]
     if not args.distributed and all(value is None for value in by_hand):
         return None
     if not args.distributed and any(value is None for value in by_hand):
-        cli.fail("--coordinator, --processes and --process: wanted all three, or --distributed")
+        fail("--coordinator, --processes and --process: wanted all three, or --distributed")
     try:
         if args.distributed:
             jax.distributed.initialize()
         else:
             jax.distributed.initialize(args.coordinator, args.processes, args.process)
     except (RuntimeError, ValueError) as error:
-        cli.fail(f"jax.distributed: {str(error).splitlines()[0]}")
+        fail(f"jax.distributed: {str(error).splitlines()[0]}")
     from jax.experimental import multihost_utils
 
     return multihost_utils.sync_global_devices
@@ -120,7 +150,7 @@ def draw(sweep: SweepConfig, folder: Path, config: str) -> None:
             require_sweep(dataset, sweep, folder)
             report(dataset.load(), sweep, folder)
     except (OSError, ValueError) as error:
-        cli.fail(f"--draw: {folder / 'sweep.nc'} with {config}: {error}")
+        fail(f"--draw: {folder / 'sweep.nc'} with {config}: {error}")
 
 
 # What decides which cases a sweep has, but for the number of their seeds.
@@ -138,11 +168,9 @@ def require_sweep(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
     try:
         held = cases_of(json.loads(dataset.attrs["sweep"]))
     except (KeyError, TypeError, ValueError):
-        cli.fail(f"--draw: {folder / 'sweep.nc'} does not say which sweep it is of")
+        fail(f"--draw: {folder / 'sweep.nc'} does not say which sweep it is of")
     if held != cases_of(to_dict(sweep)):
-        cli.fail(
-            f"--draw: {folder / 'sweep.nc'} holds another sweep: its base, axes or keys differ"
-        )
+        fail(f"--draw: {folder / 'sweep.nc'} holds another sweep: its base, axes or keys differ")
 
 
 def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:

@@ -1,13 +1,16 @@
 """The benchmark's entry: verbs, their options, what each leaves."""
 
 import json
+import re
 import sys
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
 
 from kjax.bench import controller, main
 from kjax.bench.main import main as entry
+from kjax.bench.options import BenchOptions
 
 
 @pytest.fixture
@@ -20,17 +23,18 @@ def stand_in(monkeypatch):
         (folder / "table.md").write_text("| a table |\n")
         return {"speed": 2.0, "nothing": None}
 
-    def add_arguments(parser):
-        parser.add_argument("--more", type=int, default=1)
+    @dataclass(kw_only=True)
+    class More(BenchOptions):
+        more: int = 1
 
-    module.run, module.add_arguments = run, add_arguments
+    module.run, module.OPTIONS = run, More
     monkeypatch.setitem(sys.modules, "stand_in", module)
     for name in main.MODULES:
         monkeypatch.setitem(main.MODULES, name, "stand_in")
     return module
 
 
-@pytest.mark.parametrize("verb", ["qp", "simulation", "edmd", "gradient"])
+@pytest.mark.parametrize("verb", ["qp", "simulation", "edmd", "gradient", "device"])
 def test_a_verb_gets_its_options_and_leaves_its_results(stand_in, call, capsys, tmp_path, verb):
     assert call(entry, verb, "--quick", "--more", 3, "--out", tmp_path) == 0
     (args,) = stand_in.seen
@@ -44,7 +48,7 @@ def test_a_verb_gets_its_options_and_leaves_its_results(stand_in, call, capsys, 
 def test_the_verbs_are_those_of_the_help(call, capsys):
     assert call(entry, "-h") == 0
     text = capsys.readouterr().out
-    assert "{controller,qp,simulation,edmd,gradient}" in text
+    assert "{controller,qp,simulation,edmd,gradient,device}" in text
     for verb in main.BENCHMARKS:
         assert f"\n{verb}: " in text
 
@@ -53,8 +57,8 @@ def test_the_verbs_are_those_of_the_help(call, capsys):
 def test_each_verb_has_help_of_its_own(call, capsys, verb):
     assert call(entry, verb, "--help") == 0
     text = capsys.readouterr().out
-    assert text.startswith(f"usage: benchmark.py {verb}")
-    option = {"controller": "--no-startup", "edmd": "--peers PYTHON", "qp": "--problems DIR",
+    assert re.match(rf"usage: \S+ {verb} ", text)
+    option = {"controller": "--no-startup", "edmd": "--peers NAME", "qp": "--problems PATH",
               "gradient": "--through-flight"}.get(verb, "--quick")  # fmt: skip
     assert option in text
 
@@ -62,7 +66,7 @@ def test_each_verb_has_help_of_its_own(call, capsys, verb):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "which benchmark? one of: controller, qp, simulation, edmd, gradient"),
+        ([], "which benchmark? one of: controller, qp, simulation, edmd, gradient, device"),
         (["speed"], "which benchmark?"),
         (["qp", "--quik"], "--quik"),
         (["controller", "nowhere.toml"], "nowhere.toml: no such file"),

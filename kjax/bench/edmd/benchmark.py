@@ -4,13 +4,13 @@ The peers need an interpreter of their own, which ``peers.py`` runs in: three ro
 rounds of ours in between. Everything runs on one core with one thread.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from kjax import cli
 from kjax.bench.edmd import report
 from kjax.bench.edmd.data import (
     DICTIONARIES,
@@ -36,10 +35,12 @@ from kjax.bench.edmd.data import (
     setting,
 )
 from kjax.bench.edmd.stream import STREAM, stream
+from kjax.bench.options import BenchOptions
 from kjax.bench.timing import Call, elapsed, interleaved
 from kjax.config import KoopmanConfig
 from kjax.koopman import edmd, models, observables, regression
 from kjax.koopman.dataset import Snapshots
+from kjax.options import Text, fail
 
 PEERS = ("pykoopman", "pykoop")
 SCRIPT = Path(__file__).with_name("peers.py")
@@ -56,16 +57,18 @@ TEST_ROLLOUTS, TEST_STEPS = 100, 50  # held out
 ROLLOUTS = 10_000  # whose generation is timed
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+@dataclass(kw_only=True)
+class EdmdOptions(BenchOptions):
     """Options of this benchmark."""
-    parser.add_argument(
-        "--peers",
-        metavar="PYTHON",
-        help="interpreter of an environment with pykoopman and pykoop; without it, none of them",
-    )
+
+    peers: Text = None
+    """Interpreter of an environment with pykoopman and pykoop; without it, none of them."""
 
 
-def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+OPTIONS = EdmdOptions
+
+
+def run(folder: Path, args: EdmdOptions) -> dict[str, Any]:
     """All measurements; leaves figure.png and table.md in the folder."""
     versions = peer_versions(args.peers) if args.peers else {}
     _one_thread()
@@ -215,11 +218,11 @@ def peer_versions(python: str) -> dict[str, str]:
         done = subprocess.run([python, str(SCRIPT)], capture_output=True, text=True, check=False)
         versions = json.loads(done.stdout)
     except OSError as error:
-        cli.fail(f"--peers {python}: {error.strerror}")
+        fail(f"--peers {python}: {error.strerror}")
     except json.JSONDecodeError:
-        cli.fail(f"--peers {python}: this is no Python that can run {SCRIPT.name}")
+        fail(f"--peers {python}: this is no Python that can run {SCRIPT.name}")
     if not versions:
-        cli.fail(f"--peers {python}: it has neither of {', '.join(PEERS)}")
+        fail(f"--peers {python}: it has neither of {', '.join(PEERS)}")
     return versions
 
 
@@ -229,7 +232,7 @@ def _peers(python: str | None, data: Path) -> dict[str, Any]:
     command = [str(python), str(SCRIPT), str(data), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        cli.fail(f"--peers {python}: {(done.stderr.strip() or 'it failed').splitlines()[-1]}")
+        fail(f"--peers {python}: {(done.stderr.strip() or 'it failed').splitlines()[-1]}")
     return json.loads(out.read_text(encoding="utf-8"))
 
 

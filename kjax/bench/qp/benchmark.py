@@ -1,8 +1,8 @@
 """The QP solvers beside their peers, on the QPs of closed loops; run by benchmark.py qp."""
 
-import argparse
 import importlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kjax import cli, qp
+from kjax import qp
+from kjax.bench.options import BenchOptions
 from kjax.bench.qp import checks, random_rows, report
 from kjax.bench.qp.peers import Solver, box_peers, daqp_cold
 from kjax.bench.qp.problems import record_box, record_rows
 from kjax.bench.timing import Call, median_us
+from kjax.options import File, fail
 
 BATCHES = (1, 4, 16, 64, 256, 1024, 4096)
 HORIZONS = {40: 10, 80: 20, 200: 50, 400: 100}  # variables: steps of 20 ms of the long trot
@@ -25,21 +27,22 @@ GAITS = ("trot_velocity", "bound_velocity")
 RANDOM = 1_000_000  # warm-started solves that are judged
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+@dataclass(kw_only=True)
+class QpOptions(BenchOptions):
     """Options of this benchmark."""
-    parser.add_argument(
-        "--problems",
-        type=Path,
-        metavar="DIR",
-        help="QPs to solve to 1e-9: a folder of .npz with P, q, G, h, A, b, lb, ub",
-    )
+
+    problems: File = None
+    """QPs to solve to 1e-9: a folder of .npz with P, q, G, h, A, b, lb, ub."""
 
 
-def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+OPTIONS = QpOptions
+
+
+def run(folder: Path, args: QpOptions) -> dict[str, Any]:
     """All measurements; leaves figure.png and table.md in the folder."""
     quick, seconds = args.quick, 1.0 if args.quick else 6.0
     if args.problems is not None and not any(args.problems.glob("*.npz")):
-        cli.fail(f"--problems: no .npz file in {args.problems}")
+        fail(f"--problems: no .npz file in {args.problems}")
     present = {name: _import(name) for name in PEERS}
     missing = [name for name, module in present.items() if module is None]
     if missing:

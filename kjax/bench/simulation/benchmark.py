@@ -1,6 +1,5 @@
 """Closed loops per second of both engines beside the bare ones; for benchmark.py simulation."""
 
-import argparse
 import dataclasses
 import json
 import os
@@ -18,6 +17,7 @@ import mujoco.batch
 import numpy as np
 
 from kjax.bench.machine import cores, peak_memory, two_process_speedup
+from kjax.bench.options import BenchOptions
 from kjax.bench.simulation import report
 from kjax.bench.timing import Call, elapsed, interleaved, median_ratio, reported
 from kjax.config import RunConfig, load_config
@@ -39,7 +39,7 @@ EPISODE = 0.5  # s of closed loop that are timed in C
 EPISODE_MJX = 0.25
 
 
-def run(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+def run(folder: Path, args: BenchOptions) -> dict[str, Any]:
     """All measurements; leaves figure.png and table.md in the folder."""
     quick = args.quick
     jax.config.update("jax_enable_x64", False)

@@ -1,11 +1,11 @@
 """The page of the reproduction: its table, its figures, its notes."""
 
-from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from kjax import cli
+from kjax.options import StudyOptions
 from kjax.runs.cache import Cache
 from kjax.sim.intervals import wilson
 from kjax.sim.series import Series, load_series
@@ -38,7 +38,7 @@ NOTES = (
 )
 
 
-def save_page(folder: Path, record: dict[str, Any], args: Namespace, cache: Cache) -> None:
+def save_page(folder: Path, record: dict[str, Any], args: StudyOptions, cache: Cache) -> None:
     """Write table.md, index.html and the figures.
 
     Args:
@@ -133,7 +133,7 @@ def _number(value: float | None) -> str:
 
 
 def _figures(
-    folder: Path, experiments: dict[str, Any], args: Namespace, cache: Cache
+    folder: Path, experiments: dict[str, Any], args: StudyOptions, cache: Cache
 ) -> list[tuple[str, str]]:
     """Draw what the results hold; (file, caption) of every figure there is."""
     from kjax.viz.report import switch_figure, terrain_figure, tracking_figure

@@ -7,8 +7,8 @@ torques held over a control tick. Both bases take about an hour on two quiet cor
 kjax/studies/reproduce/paper_results.py says what is run.
 """
 
-from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from kjax import cli
 from kjax.config import ConfigError, FitStudyConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.controllers.resolve import build_command
+from kjax.options import StudyOptions, fail, parse, require
 from kjax.runs.batches import batch_key, run_batch
 from kjax.runs.cache import Cache, open_cache
 from kjax.runs.pool import Run, cached_runner, open_runner
@@ -66,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 for base in args.bases:
                     there[base] = _measure(experiment, base, args, cache, run)
     except ConfigError as error:
-        cli.fail(str(error))
+        fail(str(error))
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here")
         return 130
@@ -78,25 +79,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> Namespace:
-    args = cli.parse_study(
-        argv,
-        __doc__.split("\n\n")[0],
-        NAMES,
-        counts={
-            "seeds": (16, "episodes on flat ground"),
-            "terrains": (256, "episodes on rough ground"),
-        },
-        base="both",
-        quick="2 episodes of 1.5 s each: to check the script",
-        default_out="reproduce",
-    )
+@dataclass(kw_only=True)
+class ReproduceOptions(StudyOptions):
+    """Options of the reproduction."""
+
+    names = NAMES
+
+    seeds: int = 16
+    """Episodes on flat ground."""
+
+    terrains: int = 256
+    """Episodes on rough ground."""
+
+
+def _parse(argv: Sequence[str] | None) -> ReproduceOptions:
+    args = parse(ReproduceOptions, argv, __doc__.split("\n\n")[0])
+    require(args, "seeds", "terrains", least=1)
+    args.out = args.out or Path("results") / "reproduce"
     if args.quick:
         args.seeds, args.terrains = min(args.seeds, 2), min(args.terrains, 2)
     return args
 
 
-def _add_finished(found: dict[str, Any], folder: Path, args: Namespace, cache: Cache) -> None:
+def _add_finished(
+    found: dict[str, Any], folder: Path, args: ReproduceOptions, cache: Cache
+) -> None:
     """Put on the page what is not asked for now but lies finished in the cache, of this code."""
     left_off = []
     for experiment in EXPERIMENTS:
@@ -139,7 +146,7 @@ def _fit_config(*, quick: bool) -> FitStudyConfig:
 
 
 def _measure(
-    experiment: Experiment, base: str, args: Namespace, cache: Cache, runner: Run, *,
+    experiment: Experiment, base: str, args: ReproduceOptions, cache: Cache, runner: Run, *,
     run: bool = True,
 ) -> dict[str, Any]:  # fmt: skip
     """Run what is missing of an experiment on a base; its summary and the rows of the table.

@@ -13,8 +13,8 @@ there as well: the same command goes on after Ctrl-C or a kill.
 import dataclasses
 import sys
 import time
-from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig
+from kjax.options import RunOptions, fail, parse_config, require
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
@@ -32,11 +33,68 @@ from kjax.sim.summary import summarise
 from kjax.studies.tune import report
 from kjax.tuning import loop
 from kjax.tuning.optimise import Descent, build_objective, descend
-from kjax.tuning.space import TUNABLE, Space, Variables, build_space, shown, tuned_config
+from kjax.tuning.space import Space, Variables, build_space, tuned_config
 
 TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
 POPULATION_SEEDS = 4  # MuJoCo episodes per candidate of the baseline
 SIGMA = 0.5  # of a first population, about a factor of 1.6
+
+
+@dataclass(kw_only=True)
+class TuneOptions(RunOptions):
+    """Options of a tuning."""
+
+    keys: tuple[str, ...] = ()
+    """What to tune, e.g. lmpc.Q lmpc.R; the gait's weights if left out."""
+
+    scenarios: int = 16
+    """To descend on."""
+
+    held_out: int = 32
+    """To choose the best point on."""
+
+    seconds: float = 3.0
+    """Length of a scenario."""
+
+    pieces: int = 2
+    """Velocities in a scenario's command."""
+
+    updates: int = 150
+    """Of Adam, at most."""
+
+    rate: float = 0.15
+    """Of Adam, in the log of a weight."""
+
+    patience: int = 40
+    """Updates without improvement."""
+
+    minutes: float = 15.0
+    """Wall time, at most."""
+
+    worsen: float = 1.0
+    """Begin with every parameter off by this factor, up or down."""
+
+    worsen_seed: int = 0
+    """Of which are up, which down."""
+
+    memory: float = 0.1
+    """Of the derivatives [s]; inf for the true ones, which a chaotic loop makes useless."""
+
+    baseline: bool = False
+    """CMA-ES in MuJoCo from the same start, for the same time."""
+
+    refine: bool = False
+    """CMA-ES in MuJoCo from the descent's result, likewise."""
+
+    seeds: int = 16
+    """Episodes in MuJoCo at the end."""
+
+
+@dataclass(kw_only=True)
+class Task(TuneOptions):
+    """Options, and what follows from the config: the range of velocities."""
+
+    speeds: tuple[float, float]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,13 +110,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
+def tune(config: RunConfig, args: Task, folder: Path) -> None:
     """Descend, search, compare; leaves everything in the folder."""
     short, space = shortened(config, args), None
     try:
         space = build_space(short, args.keys)
     except ValueError as error:
-        cli.fail(f"--{error}" if str(error).startswith("keys") else str(error))
+        fail(f"--{error}" if str(error).startswith("keys") else str(error))
     begin = worsened(space, args.worsen, args.worsen_seed)
     cache = open_cache(folder, Path(__file__))
     key = cache.key(short, _settings(args))
@@ -103,7 +161,7 @@ def tune(config: RunConfig, args: Namespace, folder: Path) -> None:
     print(text)
     print(f"results in {folder}/")
     if not result.healthy:
-        cli.fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
+        fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
 
 
 def _descend(
@@ -111,7 +169,7 @@ def _descend(
     space: Space,
     scenarios: tuple[loop.Scenario, loop.Scenario],
     begin: Variables,
-    args: Namespace,
+    args: Task,
     checkpoint: Path,
 ) -> Descent:
     """The descent on the training scenarios, with a bar of its progress; kept as it goes.
@@ -137,12 +195,10 @@ def _descend(
                 checkpoint=checkpoint, identity=checkpoint.stem, on_update=show,
             )  # fmt: skip
         except ValueError as error:
-            cli.fail(str(error))
+            fail(str(error))
 
 
-def _record(
-    args: Namespace, result: Descent, searches: dict[str, dict[str, Any]]
-) -> dict[str, Any]:
+def _record(args: Task, result: Descent, searches: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """What metrics.json says of how the parameters were found."""
     return {
         "provenance": cli.provenance(),
@@ -161,57 +217,17 @@ def _record(
     }  # fmt: skip
 
 
-def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Namespace]:
-    parser = cli.build_parser(RunConfig, __doc__.splitlines()[0])
-    parser.add_argument(
-        "--keys",
-        nargs="+",
-        metavar="KEY",
-        help=f"what to tune; the gait's weights by default; of: {', '.join(shown(TUNABLE))}",
-    )
-    parser.add_argument("--scenarios", type=int, default=16, help="to descend on")
-    parser.add_argument("--held-out", type=int, default=32, help="to choose the best point on")
-    parser.add_argument("--seconds", type=float, default=3.0, help="length of a scenario")
-    parser.add_argument("--pieces", type=int, default=2, help="velocities in a scenario's command")
-    parser.add_argument("--updates", type=int, default=150, help="of Adam, at most")
-    parser.add_argument("--rate", type=float, default=0.15, help="of Adam, in the log of a weight")
-    parser.add_argument("--patience", type=int, default=40, help="updates without improvement")
-    parser.add_argument("--minutes", type=float, default=15.0, help="wall time, at most")
-    parser.add_argument(
-        "--worsen",
-        type=float,
-        default=1.0,
-        metavar="FACTOR",
-        help="begin with every parameter off by this factor, up or down",
-    )
-    parser.add_argument("--worsen-seed", type=int, default=0, help="of which are up, which down")
-    parser.add_argument(
-        "--memory",
-        type=float,
-        default=0.1,
-        help="of the derivatives [s]; inf for the true ones, which a chaotic loop makes useless",
-    )
-    parser.add_argument(
-        "--baseline",
-        action="store_true",
-        help="CMA-ES in MuJoCo from the same start, for the same time",
-    )
-    parser.add_argument(
-        "--refine",
-        action="store_true",
-        help="CMA-ES in MuJoCo from the descent's result, likewise",
-    )
-    parser.add_argument("--seeds", type=int, default=16, help="episodes in MuJoCo at the end")
-    config, args = cli.parse(RunConfig, parser, argv)
-    args.speeds = min(config.command.v_x), max(config.command.v_x)
+def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Task]:
+    config, given = parse_config(TuneOptions, argv, __doc__.splitlines()[0])
     names = ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
              "minutes", "worsen", "memory", "seeds")  # fmt: skip
-    cli.require(args, *names, above=0)
+    require(given, *names, above=0)
     if config.sim.base != "planar":
-        cli.fail(f"sim.base: got '{config.sim.base}', wanted 'planar': the plant is planar")
-    if args.keys is None:
-        args.keys = _own_keys(config)
-    return config, args
+        fail(f"sim.base: got '{config.sim.base}', wanted 'planar': the plant is planar")
+    speeds = min(config.command.v_x), max(config.command.v_x)
+    task = Task(**vars(given), speeds=speeds)
+    task.keys = task.keys or _own_keys(config)
+    return config, task
 
 
 def _own_keys(config: RunConfig) -> tuple[str, ...]:
@@ -226,14 +242,14 @@ def _own_keys(config: RunConfig) -> tuple[str, ...]:
     return tuple(keys) or ("lmpc.Q", "lmpc.R")
 
 
-def _settings(args: Namespace) -> list[Any]:
+def _settings(args: Task) -> list[Any]:
     """Options that the descent depends on."""
     names = ("keys", "scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
              "worsen", "worsen_seed", "memory", "speeds")  # fmt: skip
     return [getattr(args, name) for name in names]
 
 
-def shortened(config: RunConfig, args: Namespace) -> RunConfig:
+def shortened(config: RunConfig, args: Task) -> RunConfig:
     """The config of a scenario."""
     command = CommandConfig(times=(0.0,), v_x=(0.0,))
     return dataclasses.replace(config, duration=args.seconds, command=command)
@@ -251,14 +267,14 @@ def worsened(space: Space, factor: float, seed: int) -> Variables:
     return space.inside(out)
 
 
-def evolutions(args: Namespace, begin: Variables, tuned: Variables) -> dict[str, Variables]:
+def evolutions(args: Task, begin: Variables, tuned: Variables) -> dict[str, Variables]:
     """What CMA-ES is asked to do: names, and where it begins."""
     asked = {"CMA-ES": begin} if args.baseline else {}
     return asked | ({"gradient, then CMA-ES": tuned} if args.refine else {})
 
 
 def evolve(
-    config: RunConfig, space: Space, begin: Variables, args: Namespace, seconds: float,
+    config: RunConfig, space: Space, begin: Variables, args: Task, seconds: float,
     cache: Cache, key: str,
 ) -> dict[str, Any]:  # fmt: skip
     """CMA-ES on batches of MuJoCo episodes for some wall time [s]; kept after every generation.
@@ -316,7 +332,7 @@ def evolve(
     }
 
 
-def mujoco_scenarios(config: RunConfig, args: Namespace) -> list[RunConfig]:
+def mujoco_scenarios(config: RunConfig, args: Task) -> list[RunConfig]:
     """Episodes of a candidate of the baseline: the descent's commands, in MuJoCo."""
     rng = np.random.default_rng(TRAIN_SEED)
     low, high = args.speeds

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kjax import cli
 from kjax.config import RunConfig, load_config
 from kjax.config.shipped import shipped_config
+from kjax.options import fail
 from kjax.runs.cache import Cache, CacheError, open_cache
 from kjax.sysid.transitions import Episode
 
@@ -66,7 +66,7 @@ def kept(kind: str, args: Any, folder: Path) -> dict[str, np.ndarray] | None:
     try:
         return cache.arrays(_key(cache, kind, args))
     except CacheError as error:
-        cli.fail(str(error))
+        fail(str(error))
 
 
 def _key(cache: Cache, kind: str, args: Any) -> str:

@@ -13,8 +13,8 @@ weights_<gait>.npz (all models). The recordings stay there as well and are used 
 those of other configs or other code.
 """
 
-from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 
 from kjax import cli
 from kjax.dynamics import srb_planar
+from kjax.options import Options, parse, require
 from kjax.prediction import storage
 from kjax.prediction.features import (
     Features,
@@ -90,23 +91,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> Namespace:
-    parser = cli.script_parser(__doc__.splitlines()[0])
-    parser.add_argument("--robots", type=int, default=64, help="episodes of each kind")
-    parser.add_argument("--duration", type=float, default=8.0, help="of an episode [s]")
-    parser.add_argument("--force", type=float, default=15.0, help="noise.force [N]")
-    parser.add_argument(
-        "--quick", action="store_true", help="10 robots, 3 s, flat ground, fewer models"
-    )
-    args = parser.parse_args(argv)
+@dataclass(kw_only=True)
+class WholeBodyOptions(Options):
+    """Options of the study."""
+
+    robots: int = 64
+    """Episodes of each kind."""
+
+    duration: float = 8.0
+    """Of an episode [s]."""
+
+    force: float = 15.0
+    """noise.force [N]."""
+
+    quick: bool = False
+    """10 robots, 3 s, flat ground, fewer models: to check the script."""
+
+
+def _parse(argv: Sequence[str] | None) -> WholeBodyOptions:
+    args = parse(WholeBodyOptions, argv, __doc__.splitlines()[0])
     if args.quick:
         args.robots, args.duration = 10, 3.0
-    if args.robots < 10:
-        cli.fail(f"--robots: got {args.robots}, wanted at least 10")
-    if not args.duration >= 3.0:
-        cli.fail(f"--duration: got {args.duration} s, wanted at least 3 s")
-    if not args.force > 0.0:
-        cli.fail(f"--force: got {args.force} N, wanted more than 0")
+    require(args, "robots", least=10)
+    require(args, "duration", least=3)
+    require(args, "force", above=0)
     return args
 
 
@@ -122,7 +130,9 @@ def _save_models(gait: str, fits: dict[str, whole_body.Fit], folder: Path) -> No
     np.savez(folder / f"weights_{gait}.npz", dt=DT, **weights)
 
 
-def _summary(args: Namespace, metrics: dict[str, Any], families: dict[str, Any]) -> dict[str, Any]:
+def _summary(
+    args: WholeBodyOptions, metrics: dict[str, Any], families: dict[str, Any]
+) -> dict[str, Any]:
     """What metrics.json holds."""
     chosen = metrics["trot"]["chosen_inside"]
     trot = {name: metrics["trot"]["inside"][name]["50ms"]["all"] for name in (chosen, "affine")}

@@ -1,0 +1,31 @@
+"""``kjax study NAME``: studies that no verb of their own starts."""
+
+import sys
+from collections.abc import Sequence
+
+from kjax.options import fail
+
+STUDIES = {
+    "invariance": "does a walk depend on where zero is, on its floor, its heading, float32?",
+    "raw_steps": "steps of the command without a ramp, at random phases",
+    "koopman_study": "which models predict the rigid body, how far, and how sure",
+    "whole_body": "residual models from recordings of the whole robot",
+    "model_walks": "what each prediction model walks like, tuned alike",
+    "learn_control": "a dictionary learned through the closed loop",
+}
+_PACKAGES = {"whole_body": "kjax.studies.whole_body.study"}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Start the study that the first word names."""
+    from kjax.commands.main import start_module
+
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help"):
+        print("usage: kjax study NAME [options]\n")
+        print("\n".join(f"  {name:14} {text}" for name, text in STUDIES.items()))
+        return 0
+    if words[0] not in STUDIES:
+        fail(f"kjax study {words[0]}: wanted one of {', '.join(STUDIES)}")
+    module = _PACKAGES.get(words[0], f"kjax.studies.{words[0]}")
+    return start_module(module, f"kjax study {words[0]}", words[1:])
