@@ -7,6 +7,7 @@ A verb is a module with ``main(argv) -> int``, imported when it is asked for.
 
 import difflib
 import importlib
+import importlib.util
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -30,6 +31,10 @@ VERBS = {
     "configs": ("kjax.commands.configs", "the shipped configs, or the text of one"),
     "doctor": ("kjax.commands.doctor", "versions, devices, graphics, cache: what is missing"),
 }
+# Extras without which a verb cannot end well; the others' modules say it when they are imported.
+NEEDS = {"run": ("sim", "viz"), "fit": ("viz",), "sweep": ("sim", "sweep", "viz"),
+         "reproduce": ("sim", "viz"), "envelope": ("sim", "viz"), "tune": ("sim", "learn", "viz"),
+         "bench": ("sim", "viz"), "study": ("sim", "viz")}  # fmt: skip
 # What is imported, and the extra that brings it.
 EXTRAS = {
     "sim": ("mujoco", "filelock", "tqdm"),
@@ -59,7 +64,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         near = difflib.get_close_matches(verb, VERBS, n=1)
         fail(f"kjax {verb}: no such command" + (f"; did you mean kjax {near[0]}?" if near else "")
              + " (kjax --help lists them)")  # fmt: skip
+    if not {"-h", "--help"} & set(words):
+        require_extras(f"kjax {verb}", NEEDS.get(verb, ()))
     return start_module(VERBS[verb][0], f"kjax {verb}", words[1:])
+
+
+def require_extras(called: str, extras: Sequence[str]) -> None:
+    """End the program, before it has spent any time, where a package of the extras is missing."""
+    for extra in extras:
+        for name in EXTRAS[extra]:
+            if importlib.util.find_spec(name) is None:
+                fail_missing(called, name, extra)
+
+
+def fail_missing(called: str, name: str, extra: str) -> NoReturn:
+    """Say which package is missing, and how to get it."""
+    fail(f"{called} needs {name}; install it with: pip install 'kjax[all]' "
+         f"(or the extra '{extra}' alone)")  # fmt: skip
 
 
 def start_module(name: str, called: str, words: Sequence[str]) -> int:
@@ -73,8 +94,7 @@ def start_module(name: str, called: str, words: Sequence[str]) -> int:
         extra = next((key for key, names in EXTRAS.items() if missing in names), None)
         if extra is None:
             raise
-        fail(f"{called} needs {missing}; install it with: pip install 'kjax[all]' "
-             f"(or the extra '{extra}' alone)")  # fmt: skip
+        fail_missing(called, missing, extra)
 
 
 def usage() -> str:

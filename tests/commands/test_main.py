@@ -71,6 +71,16 @@ def test_what_is_not_installed_is_named_with_the_extra_that_brings_it(call, caps
     )
 
 
+def test_what_a_verb_needs_at_its_end_is_asked_for_at_its_beginning(call, capsys, monkeypatch):
+    find = main.importlib.util.find_spec
+    monkeypatch.setattr(
+        main.importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name)
+    )
+    assert call(kjax, "fit", "koopman_fit") == 2
+    assert capsys.readouterr().err.startswith("error: kjax fit needs matplotlib; ")
+    assert set(main.NEEDS) <= set(main.VERBS)
+
+
 def test_a_module_of_our_own_that_is_missing_is_no_users_mistake(call, monkeypatch):
     monkeypatch.setitem(main.VERBS, "run", ("kjax.nowhere", ""))
     with pytest.raises(ModuleNotFoundError):
