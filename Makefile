@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup trot trot-long fit reproduce envelope test test-fast check benchmark clean
+.PHONY: setup trot trot-long fit reproduce envelope test test-fast check docs notebooks benchmark clean
 
 setup: $(STAMP)
 
@@ -38,15 +38,23 @@ test: setup  ## everything
 test-fast: setup  ## without the slow tests
 	$(PYTEST) -m "not slow"
 
+docs: setup  ## the site, in docs/_build/html; warnings are errors
+	$(BIN)/python docs/refresh.py
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
+
+notebooks: setup  ## run the notebooks and leave their executed twins in docs/notebooks
+	$(BIN)/python docs/refresh.py --notebooks
+
 check: setup  ## what to run before a commit
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(MAKE) docs
 	$(MAKE) test-fast
 
 benchmark: setup
 	$(BIN)/python experiments/benchmark.py controller
 
 clean:
-	rm -rf results .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf results docs/_build .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis

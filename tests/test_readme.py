@@ -1,5 +1,6 @@
 """What the README and the pages in docs/ show is run as written."""
 
+import importlib.util
 import re
 
 import jax
@@ -14,8 +15,35 @@ from kjax.sim.observe import find_addresses
 from kjax.sim.resolve import build_scene
 
 PAGES = ("README.md", *(f"docs/{name}.md" for name in (
-    "results", "your_own_loop", "gaits", "sweeps", "qp", "models", "tuning",
+    "index", "install", "first_walk", "your_own_loop", "gaits", "models", "qp", "sweeps", "tuning",
+    "threads", "results", "reproduction", "benchmarks", "conventions", "faq", "changelog",
+    "contributing",
 )))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def refresh(repository):
+    spec = importlib.util.spec_from_file_location("refresh", repository / "docs" / "refresh.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_tables_of_a_page_are_those_of_the_recorded_results(repository, refresh, page):
+    text = (repository / page).read_text(encoding="utf-8")
+    assert refresh.refreshed(text) == text, "run: python docs/refresh.py"
+
+
+def test_a_number_that_is_not_recorded_is_found(repository, refresh):
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    assert "**0.0128**" in text
+    assert refresh.refreshed(text.replace("**0.0128**", "**0.0100**")) == text
+
+
+def test_every_page_is_on_the_site(repository):
+    toc = (repository / "docs" / "index.md").read_text(encoding="utf-8")
+    assert all(re.search(rf"^{page[5:-3]}$", toc, re.MULTILINE) for page in PAGES[2:])
 
 
 def blocks(repository, page, language):

@@ -117,8 +117,6 @@ def fit(
 
         K = argmin sum_i |Pi(y_i) - Pi(x_i) - K [Pi(x_i); u_i]|^2,   A = I + K_Pi,   B = K_u
 
-        K = argmin sum_i |Pi(y_i) - Pi(x_i) - K [Pi(x_i); u_i]|^2,   A = I + K_Pi,   B = K_u
-
     Args:
       dictionary: observables.
       data: snapshots of that mode.

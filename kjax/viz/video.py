@@ -15,16 +15,18 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw
+from tqdm import tqdm
 
 from kjax.config import RunConfig, load_config
 from kjax.robots import get_robot
 from kjax.sim.trajectory import Trajectory
 from kjax.types import Leg
 
-FPS = 25
+FPS = 20
 # Left legs are behind the right ones in a view from the right.
 _FAR_TO_NEAR = {Leg.FL: "#90cdf4", Leg.RL: "#9ae6b4", Leg.FR: "#c53030", Leg.RR: "#dd6b20"}
 SIZE = (640, 368)  # pixels; multiples of 16, as video codecs want
+SHADOW_MAP = 1024  # pixels; MuJoCo's 4096 and its multisampling double a software renderer's time
 
 
 def save_video(trajectory_file: Path, config_file: Path, path: Path) -> str:
@@ -38,19 +40,32 @@ def save_video(trajectory_file: Path, config_file: Path, path: Path) -> str:
     wanted = os.environ.get("MUJOCO_GL")
     failures = []
     for backend in [wanted] if wanted else ["egl", "osmesa"]:
-        command = [sys.executable, "-m", "kjax.viz.video"]
-        child = subprocess.run(
-            [*command, str(trajectory_file), str(config_file), str(path)],
-            env={**os.environ, "MUJOCO_GL": backend},
-            capture_output=True,
-            text=True,
-        )
-        if child.returncode == 0:
+        code, last = _in_child(backend, str(trajectory_file), str(config_file), str(path))
+        if code == 0:
             return f"rendered with MuJoCo ({backend})"
-        last = (child.stderr.strip().splitlines() or ["no message"])[-1]
         failures.append(f"{backend}: {last[:120]}")
     stick_video(Trajectory.load(trajectory_file), load_config(RunConfig, config_file), path)
     return "no GL library loads (" + "; ".join(failures) + "): drew a stick animation"
+
+
+def _in_child(backend: str, *words: str) -> tuple[int, str]:
+    """Render in a process of its own, with a bar of its progress; exit code and last words."""
+    with tempfile.TemporaryFile("w+") as errors:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "kjax.viz.video", *words],
+            env={**os.environ, "MUJOCO_GL": backend},
+            stdout=subprocess.PIPE, stderr=errors, text=True,
+            close_fds=False,  # starts it without a fork, which JAX's threads do not bear
+        )  # fmt: skip
+        assert child.stdout is not None
+        with tqdm(desc="video", unit="frame", leave=False, disable=None) as bar:
+            for line in child.stdout:  # "FRAMES of ALL"
+                done, _, total = line.partition(" of ")
+                bar.total = int(total)
+                bar.update(int(done) - bar.n)
+        code = child.wait()
+        errors.seek(0)
+        return code, (errors.read().strip().splitlines() or ["no message"])[-1]
 
 
 def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
@@ -60,15 +75,20 @@ def render_video(run: Trajectory, config: RunConfig, path: Path) -> None:
     from kjax.sim.resolve import build_scene
 
     model = build_scene(config)
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = SHADOW_MAP, 0
+    model.vis.global_.offwidth, model.vis.global_.offheight = SIZE
     data = mujoco.MjData(model)
     renderer = mujoco.Renderer(model, height=SIZE[1], width=SIZE[0])
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+    frames = _frames(run)
     with _writer(path) as writer:
-        for i in _frames(run):
+        for done, i in enumerate(frames, 1):
             data.qpos[:], data.qvel[:] = run.qpos[i], run.qvel[i]
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera="side")
             writer.append_data(_captioned(renderer.render(), run, i))
+            if done % 10 == 0 or done == len(frames):
+                print(f"{done} of {len(frames)}", flush=True)
     renderer.close()
 
 

@@ -1,0 +1,313 @@
+"""Write the tables and pictures of the README and the docs again, from the recorded results.
+
+    python docs/refresh.py
+    python docs/refresh.py --notebooks     # runs them, minutes
+
+A table stands between two comments, ``<!-- table: NAME -->`` and ``<!-- end -->``; NAME is a
+function below, which reads JSON in ``docs/results/``. A test compares them with what stands there.
+"""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
+PAGES = ("README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
+BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+LIMIT = 300_000  # bytes of an executed notebook
+
+TABLES: dict[str, Callable[[], str]] = {}
+
+
+def table(function: Callable[[], str]) -> Callable[[], str]:
+    """Make a function's text available under its name."""
+    TABLES[function.__name__] = function
+    return function
+
+
+def load(name: str, file: str = "metrics.json") -> Any:
+    """Recorded results of a command."""
+    return json.loads((RESULTS / name / file).read_text(encoding="utf-8"))
+
+
+def markdown(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """A Markdown table."""
+    lines = [header, ("---",) * len(header), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def recorded(name: str, file: str = "metrics.json") -> str:
+    """When, where and at which revision results were made."""
+    found = load(name, file)["provenance"]
+    return (
+        f"{found['created'][:10]}, {found['machine']}, jax {found['versions']['jax']}, "
+        f"revision {found['git_revision'][:7]}"
+    )
+
+
+class Reproduced:
+    """The episodes of ``make reproduce``, by experiment and base."""
+
+    def __init__(self) -> None:
+        self.found = load("reproduce", "results.json")["experiments"]
+
+    def row(self, experiment: str, base: str, metric: str) -> dict[str, Any]:
+        """Median, interval and worst of a metric."""
+        rows = self.found[experiment][base]["rows"]
+        return next(row for row in rows if row["metric"] == metric)
+
+    def median(self, experiment: str, base: str, metric: str, form: str) -> str:
+        """The median, formatted."""
+        return format(self.row(experiment, base, metric)["median"], form)
+
+    def both(self, experiment: str, metric: str, form: str) -> str:
+        """The planar median, and the free base's in parentheses."""
+        planar, free = (self.median(experiment, base, metric, form) for base in ("planar", "free"))
+        return f"**{planar}** ({free})"
+
+    def count(self, experiment: str, base: str, what: str) -> tuple[int, int]:
+        """How many episodes fell, or crossed, of how many."""
+        summary = self.found[experiment][base]["summary"]
+        return int(summary[what]), int(summary["runs"])
+
+
+@table
+def readme_results() -> str:
+    """What the README says beside the paper."""
+    got, speed = Reproduced(), load("benchmark_controller")
+    rmse = "velocity_rmse_mps"
+    rough = {}
+    for name in ("trot_rough", "bound_rough"):
+        (planar, of), (free, _) = (got.count(name, base, "crossed") for base in ("planar", "free"))
+        rough[name] = f"{planar} of {of} ({free})"
+    fell, of = got.count("bound_to_trot", "planar", "falls")
+    peak = [got.median("bound_to_trot", b, "switch_pitch_max_deg", ".1f") for b in BASES]
+    return markdown(
+        ("", "paper", "kjax"),
+        [
+            ("trot through the velocity profile: RMSE of v_x [m/s]", "0.029",
+             got.both("trot_velocity", rmse, ".4f")),
+            ("the same, predicting 0.2 s instead of 6 ms", "",
+             got.both("trot_velocity_long", rmse, ".4f")),
+            ("bound, the paper's timing: RMSE of v_x [m/s]", "0.189",
+             got.both("bound_multiphase", rmse, ".3f")),
+            ("the same with the paper's horizon, within the stance", "0.189",
+             got.both("bound_velocity", rmse, ".3f")),
+            ("trot over the paper's rough field: crossed", "one run", rough["trot_rough"]),
+            ("bound over it at 0.75 m/s: crossed", "one run", rough["bound_rough"]),
+            ("bound to trot in flight: fell; largest pitch", "smooth",
+             f"{fell} of {of}; {peak[0]}° ({peak[1]}°)"),
+            ("plan, act [ms]", "about 3 (QP alone)",
+             f"{speed['plan_ms_median']:.2f}, {speed['act_ms_median']:.2f}"),
+        ],
+    )  # fmt: skip
+
+
+BASES = ("planar", "free")
+
+
+@table
+def readme_speed() -> str:
+    """Four figures of speed."""
+    loop, batch = load("benchmark_controller"), load("benchmark_simulation")
+    box = load("benchmark_qp")["box"]["trot_velocity"]
+    device = load("benchmark_device")["devices"]["gpu"]
+    ticks = max(device["controller"].values(), key=lambda entry: entry["per_s"])
+    walks = max(device["mjx"].values(), key=lambda entry: entry["per_s"])
+    scan, daqp = (box[k]["us_median"] for k in ("kjax in a scan, value", "daqp, warm"))
+    return markdown(
+        ("", ""),
+        [
+            ("one robot at 1 kHz in C MuJoCo, one core",
+             f"{loop['realtime_factor']:.1f} x real time"),
+            ("1,024 robots in C MuJoCo, two cores",
+             f"{batch['c']['trot, held, 1024']['robot_steps_per_s'] / 1e3:.0f} k steps/s, "
+             f"{batch['c_held_over_bare']:.2f} of bare MuJoCo"),
+            ("the trot's QP (24 forces) in a scan, warm; daqp", f"{scan:.1f} µs; {daqp:.1f} µs"),
+            ("one H200: controllers; robots on MJX",
+             f"{ticks['per_s'] / 1e6:.1f} M ticks/s; {walks['per_s'] / 1e6:.1f} M steps/s"),
+        ],
+    )  # fmt: skip
+
+
+@table
+def walks() -> str:
+    """Gaits, rough ground and switches: both bases beside the paper."""
+    got = Reproduced()
+
+    def flat(name: str, base: str, form: str) -> str:
+        rmse, pitch = (got.row(name, base, m) for m in ("velocity_rmse_mps", "pitch_p95_deg"))
+        fell, of = got.count(name, base, "falls")
+        return (f"{rmse['median']:{form}} ({rmse['worst']:{form}}), {fell} of {of} fell; "
+                f"pitch 95 %: {pitch['median']:.2g}°")  # fmt: skip
+
+    def field(name: str, base: str) -> str:
+        crossed = got.row(name, base, "crossed")
+        rmse, pitch = (got.row(name, base, m) for m in ("velocity_rmse_mps", "field_pitch_p95_deg"))
+        done, of = got.count(name, base, "crossed")
+        return (f"{done} of {of} crossed ({100 * crossed['low']:.1f} to "
+                f"{100 * crossed['high']:.1f} %); RMSE {rmse['median']:.3f}; pitch 95 % in the "
+                f"field {pitch['median']:.1f}° ({pitch['worst']:.1f}°)")  # fmt: skip
+
+    def switch(name: str, base: str) -> str:
+        peak, settle = (got.row(name, base, m) for m in ("switch_pitch_max_deg", "pitch_settle_s"))
+        fell, of = got.count(name, base, "falls")
+        return (f"{fell} of {of} fell; peak {peak['median']:.1f}° ({peak['worst']:.1f}°), settled "
+                f"after {settle['median']:.2f} s ({settle['worst']:.2f} s)")  # fmt: skip
+
+    lines = [
+        ("trot steps, 6 x 1 ms: RMSE of v_x [m/s]", "0.029",
+         lambda b: flat("trot_velocity", b, ".4f")),
+        ("trot steps, 10 x 20 ms", "", lambda b: flat("trot_velocity_long", b, ".4f")),
+        ("bound steps, the paper's timing", "0.189", lambda b: flat("bound_multiphase", b, ".3f")),
+        ("the same within the stance (the paper's horizon)", "0.189",
+         lambda b: flat("bound_velocity", b, ".3f")),
+        ("bound steps, short flights", "", lambda b: flat("bound_multiphase_short", b, ".3f")),
+        ("the same within the stance", "", lambda b: flat("bound_velocity_short", b, ".3f")),
+        ("trot over the paper's field, 0.3 m/s", "one run, ±3° but for two slips",
+         lambda b: field("trot_rough", b)),
+        ("bound over it, 0.75 m/s", "one run", lambda b: field("bound_rough", b)),
+        ("trot to bound at any time", "works", lambda b: switch("trot_to_bound", b)),
+        ("bound to trot in flight", "smooth", lambda b: switch("bound_to_trot", b)),
+        ("bound to trot in mid-stance (control)", "disturbs",
+         lambda b: switch("bound_to_trot_naive", b)),
+    ]  # fmt: skip
+    header = ("16 seeds, 256 fields or 16 request times; median (worst)", "paper", *BASES)
+    return markdown(header, [(name, paper, *map(of, BASES)) for name, paper, of in lines])
+
+
+@table
+def single_loop() -> str:
+    """Times of the single robot's loop."""
+    found = load("benchmark_controller")
+    return markdown(
+        ("one robot, one core", ""),
+        [
+            ("plan (lift, linear term, QP) and act [ms]",
+             f"{found['plan_ms_median']:.3f} and {found['act_ms_median']:.3f}"),
+            ("an empty jitted call [ms]", f"{found['noop_ms_median']:.3f}"),
+            ("simulated over wall time, 1 kHz torque loop", f"{found['realtime_factor']:.1f}"),
+            ("whole main job, first run with an empty compile cache, and second [s]",
+             f"{found['first_run_s']:.0f} and {found['second_run_s']:.0f}"),
+            ("recorded", recorded("benchmark_controller")),
+        ],
+    )  # fmt: skip
+
+
+def _copied(name: str) -> Callable[[], str]:
+    def copied() -> str:
+        text = (RESULTS / name / "table.md").read_text(encoding="utf-8").strip()
+        return f"Recorded {recorded(name)}.\n\n{text}\n"
+
+    copied.__name__ = name
+    return copied
+
+
+for _name in ("benchmark_simulation", "benchmark_qp", "benchmark_edmd", "benchmark_gradient",
+              "benchmark_device"):  # fmt: skip
+    table(_copied(_name))
+
+
+@table
+def reproduction() -> str:
+    """The whole table of ``make reproduce``."""
+    text = (RESULTS / "reproduce" / "table.md").read_text(encoding="utf-8").strip()
+    return f"Recorded {recorded('reproduce', 'results.json')}.\n\n{text}\n"
+
+
+def refreshed(text: str) -> str:
+    """A page with its tables as the results have them."""
+    return BLOCK.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], text)
+
+
+def conventions(path: Path) -> None:
+    """Frames, signs and orders in one picture: side view, legs from above, phases of a gait."""
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    fig, (side, top, clock) = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+    angle = 0.16
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    body = np.array([[0.28, 0.05], [0.28, -0.05], [-0.28, -0.05], [-0.28, 0.05]]) @ rotation.T
+    side.fill(*(body + np.array([0.0, 0.3])).T, color="0.8", ec="0.3")
+    side.axhline(0.0, color="0.4")
+    side.plot(0.0, 0.3, "o", color="C3")
+    side.annotate("centre of mass\n(p_x, p_z)", (0.0, 0.3), (-0.12, 0.42), ha="right",
+                  arrowprops={"arrowstyle": "-", "color": "0.5"})  # fmt: skip
+    for x, name in ((0.22, "front"), (-0.2, "rear")):
+        side.annotate("", (x, 0.17), (x - 0.02, 0.0),
+                      arrowprops={"arrowstyle": "-|>", "color": "C0", "lw": 2})  # fmt: skip
+        side.text(x + 0.02, 0.06, f"F, {name}\n(on the robot)", color="C0", fontsize=8)
+    bent = {"arrowstyle": "-|>", "color": "C3", "connectionstyle": "arc3,rad=.35"}
+    side.annotate("", (0.42, 0.42), (0.42, 0.26), arrowprops=bent)
+    side.text(0.47, 0.33, "θ, ω > 0:\nnose up", color="C3", fontsize=9)
+    for (dx, dz), name in (((0.12, 0.0), "x: forward"), ((0.0, 0.12), "z: up")):
+        side.annotate("", (-0.62 + dx, 0.05 + dz), (-0.62, 0.05), arrowprops={"arrowstyle": "->"})
+        side.text(-0.6 + dx, 0.06 + dz, name, fontsize=8)
+    side.set(xlim=(-0.7, 0.75), ylim=(-0.05, 0.55), aspect="equal", title="side view, world frame")
+    side.axis("off")
+
+    for i, (x, y, name) in enumerate(
+        ((0.19, -0.13, "FR"), (0.19, 0.13, "FL"), (-0.19, -0.13, "RR"), (-0.19, 0.13, "RL"))
+    ):
+        top.plot(x, y, "o", ms=26, color="0.85", mec="0.3")
+        top.text(x, y, f"{i}\n{name}", ha="center", va="center", fontsize=8)
+    top.add_patch(plt.Rectangle((-0.24, -0.08), 0.48, 0.16, color="0.93", ec="0.3"))
+    top.annotate("", (0.36, 0.0), (0.26, 0.0), arrowprops={"arrowstyle": "->"})
+    top.text(0.37, 0.0, "x", va="center")
+    top.annotate("", (0.0, 0.24), (0.0, 0.1), arrowprops={"arrowstyle": "->"})
+    top.text(0.0, 0.25, "y: left", ha="center")
+    top.text(0.0, 0.0, "joints of a leg:\nabduction, thigh, calf", ha="center", va="center",
+             fontsize=8)  # fmt: skip
+    top.set(xlim=(-0.35, 0.45), ylim=(-0.25, 0.32), aspect="equal", title="legs from above")
+    top.axis("off")
+
+    trot = {"FR": 0.0, "FL": 0.5, "RR": 0.5, "RL": 0.0}
+    for row, offset in enumerate(reversed(trot.values())):
+        for cycle in (-1, 0, 1):
+            clock.barh(row, 0.5, left=cycle + offset, color="C0", height=0.6)
+    clock.set(xlim=(0.0, 1.0), yticks=range(4), yticklabels=list(reversed(trot)))
+    clock.set(
+        xlabel="part of the cycle", title="trot: offset is touchdown,\nduty the stance (blue)"
+    )
+    fig.savefig(path, dpi=110)
+    plt.close(fig)
+
+
+def execute_notebooks(folder: Path) -> None:
+    """The notebooks as executed ``.ipynb`` twins, for the site and for Jupyter."""
+    folder.mkdir(exist_ok=True)
+    for source in sorted((ROOT / "notebooks").glob("*.py")):
+        twin = folder / f"{source.stem}.ipynb"
+        command = ["-m", "jupytext", "--to", "ipynb", "--execute", "--run-path", str(ROOT)]
+        subprocess.run([sys.executable, *command, "--output", twin, source], check=True)
+        size = twin.stat().st_size
+        print(f"{twin.name}: {size / 1000:.0f} kB")
+        if size > LIMIT:
+            raise SystemExit(
+                f"{twin.name}: {size / 1000:.0f} kB, wanted less than {LIMIT / 1000:g}"
+            )
+
+
+def main() -> None:
+    """Refresh all pages and pictures, and say which changed."""
+    if "--notebooks" in sys.argv[1:]:
+        execute_notebooks(ROOT / "docs" / "notebooks")
+    for name in PAGES:
+        page = ROOT / name
+        before = page.read_text(encoding="utf-8")
+        after = refreshed(before)
+        if after != before:
+            page.write_text(after, encoding="utf-8")
+            print(f"{name}: tables written again")
+    conventions(ROOT / "docs" / "images" / "conventions.png")
+
+
+if __name__ == "__main__":
+    main()
