@@ -1,14 +1,19 @@
 """What the README and the pages in docs/ show is run as written."""
 
 import importlib.util
+import inspect
 import re
+import shlex
 
 import jax
 import mujoco
 import numpy as np
 import pytest
 
-from kjax.config import RunConfig, SimConfig
+from kjax.bench import main as bench
+from kjax.commands import main, study
+from kjax.config import ConfigError, RunConfig, SimConfig
+from kjax.config.shipped import find_config
 from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim.observe import find_addresses
@@ -141,11 +146,58 @@ def test_the_models_example_runs(repository):
     assert np.isfinite(scope["predicted"]).all()
 
 
+def commands(text):
+    """The words of each line that starts kjax, without its comment."""
+    whole = text.replace("\\\n", " ")
+    return [shlex.split(line, comments=True) for line in whole.splitlines() if "kjax " in line]
+
+
+def require_command(words):
+    """Fail where a verb, study, config or option of a command is not there."""
+    if "kjax" not in words:  # a comment, or pip
+        return
+    verb, *rest = words[words.index("kjax") + 1 :]
+    if verb == "study":
+        verb, *rest = rest
+        assert verb in study.STUDIES
+        module = study._PACKAGES.get(verb, f"kjax.studies.{verb}")
+    elif verb.startswith("--") or verb == "COMMAND":
+        return
+    else:
+        module = main.VERBS[verb][0]
+    if verb in ("run", "tune", "sweep") and rest and not rest[0].startswith("-"):
+        own = (rest[0].endswith(".toml") and "results/" in rest[0]) or rest[0] in (
+            "my.toml",
+            "S.toml",
+        )
+        assert own or find_config(rest[0]).is_file(), rest[0]
+    modules = [module, "kjax.options"]
+    if verb == "bench":
+        modules += ["kjax.bench.options", *bench.MODULES.values()]
+    source = "".join(inspect.getsource(importlib.import_module(name)) for name in modules)
+    for option in rest:
+        name = option.partition("=")[0].removeprefix("--")
+        if option.startswith("--") and "." not in name and name not in ("help", "help-config"):
+            field = name.replace("-", "_")
+            known = re.search(rf"^    {field}: ", source, re.MULTILINE)
+            assert known or field in RunConfig.__dataclass_fields__, option
+
+
+def test_a_command_that_does_not_exist_is_found():
+    for line in ("kjax rnu", "kjax run trot_velocty", "kjax run trot_velocity --viedo",
+                 "kjax study nothing"):  # fmt: skip
+        (words,) = commands(line + "  # a comment")
+        with pytest.raises((AssertionError, KeyError, ConfigError)):
+            require_command(words)
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_the_commands_name_files_and_keys_that_exist(page, repository):
     text = "\n".join(blocks(repository, page, "bash"))
     for path in re.findall(r"(?:experiments|configs)/\w+\.\w+", text):
         assert (repository / path).is_file(), path
+    for line in commands(text):
+        require_command(line)
     targets = (repository / "Makefile").read_text()
     for target in re.findall(r"make ([\w-]+)", text):
         assert f"\n{target}: " in targets, target
@@ -154,7 +206,7 @@ def test_the_commands_name_files_and_keys_that_exist(page, repository):
 def test_there_are_commands_pictures_and_targets_to_look_for(repository):
     """The checks beside this one pass on a page that has none of them."""
     text = "\n".join(one for page in PAGES for one in blocks(repository, page, "bash"))
-    assert len(re.findall(r"experiments/\w+\.py", text)) > 20
+    assert len(commands(text)) > 30
     assert "make setup" in text
     links = re.findall(r"\]\(([^)#:]+)\)", (repository / "README.md").read_text(encoding="utf-8"))
     assert len(links) > 5
