@@ -215,6 +215,12 @@ for _name in ("benchmark_simulation", "benchmark_qp", "benchmark_edmd", "benchma
 
 
 @table
+def tune_trot() -> str:
+    """The table of a tuning, as its command leaves it."""
+    return (RESULTS / "tune_trot" / "table.md").read_text(encoding="utf-8").strip() + "\n"
+
+
+@table
 def reproduction() -> str:
     """The whole table of ``make reproduce``."""
     text = (RESULTS / "reproduce" / "table.md").read_text(encoding="utf-8").strip()
