@@ -41,7 +41,7 @@ class Clip:
 
 
 STEADY = {"command.times": [0.0], "lmpc.command_slew": 1.0, "sim.base": "free"}
-CLIPS = (
+CLIPS: tuple[Clip, ...] = (
     Clip("trot_velocity_long", "trot, 0.6 m/s", 1.5, 4.0, STEADY | {"command.v_x": [0.6]}),
     Clip("bound_multiphase", "bound, 0.8 m/s", 2.5, 5.0, STEADY | {"command.v_x": [0.8]}),
     Clip("bound_to_trot", "bound to trot, in flight", 2.0, 4.5, {"sim.base": "free"}),
