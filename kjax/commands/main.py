@@ -38,7 +38,7 @@ NEEDS = {"run": ("sim", "viz"), "fit": ("viz",), "sweep": ("sim", "sweep", "viz"
 # What is imported, and the extra that brings it.
 EXTRAS = {
     "sim": ("mujoco", "filelock", "tqdm"),
-    "viz": ("matplotlib", "imageio", "imageio_ffmpeg", "PIL"),
+    "viz": ("matplotlib", "imageio", "imageio_ffmpeg", "PIL", "jinja2"),
     "sweep": ("xarray", "h5netcdf", "h5py"),
     "learn": ("optax", "cma"),
     "dev": ("scipy", "daqp"),

@@ -1,8 +1,8 @@
 """Run a whole sweep of closed loops: a grid or a random sample of configs, times seeds.
 
-Leaves sweep.nc (labelled, xarray), summary.json and figure.png of what its [figure] asks for, and
-in cache/ a file per chunk, in the output folder. Run again, it goes on where it stopped;
-finished, it only draws.
+Leaves sweep.nc (labelled, xarray), summary.json, figure.png of what its [figure] asks for, both in
+one index.html, and in cache/ a file per chunk, in the output folder. Run again, it goes on where it
+stopped; finished, it only draws.
 """
 
 import json
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
+import numpy as np
 from tyro.conf import Positional, arg
 
 from kjax import cli
@@ -183,7 +184,51 @@ def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
         **sweep_summary(dataset, sweep),
     }
     cli.save_json(folder / "summary.json", record)
+    save_page(folder, record, [summary_line(dataset)])
     print(summary_line(dataset))
+
+
+def save_page(folder: Path, record: dict[str, Any], notes: list[str]) -> None:
+    """The finished sweep as one file: figure, and a row for each of its points."""
+    from kjax.viz.page import Page, write_page
+
+    header, rows = points(record)
+    count = record["episodes_per_point"]
+    notes = [*notes, f"{count} episodes at each point; in parentheses the 95 % interval."]
+    page = Page(
+        title=f"Sweep {folder.name}", notes=notes, header=header, rows=rows,
+        figures=[(folder / "figure.png", "What the sweep found")],
+        provenance=record["provenance"],
+    )  # fmt: skip
+    write_page(folder / "index.html", page)
+
+
+def points(record: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Header, and for each point of a summary the values of its axes and its metrics."""
+    dims = record["dimensions"]
+    metrics = [name for name, one in record.items() if isinstance(one, dict) and "value" in one]
+    shape = np.shape(record[metrics[0]]["value"])
+    # A random sample has one dimension, its points, along which every axis has a value.
+    axes = dims if all(dim in record for dim in dims) else [
+        name for name, one in record.items()
+        if np.ndim(one) == 1 and len(one) == shape[0] and name not in (*metrics, "dimensions")
+    ]  # fmt: skip
+    rows = []
+    for index in np.ndindex(*shape):
+        own = index if axes is dims else index * len(axes)
+        row = [_shown(record[axis][i]) for axis, i in zip(axes, own, strict=True)]
+        for name in metrics:
+            value, low, high = (_shown(np.asarray(record[name][part])[index]) for part in PARTS)
+            row.append(f"{value} ({low} to {high})")
+        rows.append(row)
+    return [*axes, *metrics], rows
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float | int | np.number) else str(value)
+
+
+PARTS = ("value", "low", "high")
 
 
 def summary_line(dataset: Any) -> str:

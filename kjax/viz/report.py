@@ -1,6 +1,5 @@
-"""Figures over many episodes, and the page that shows them beside the table."""
+"""Figures over many episodes."""
 
-import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -186,49 +185,6 @@ def _bracket(axis: Axes, y: int, one: Mapping[str, Any]) -> None:
     reached = one.get("reached_mps") if one["unit"] == "m/s" else None
     text = f"{passed:.3g}" + ("" if reached is None else f", reached {reached:.3g}")
     axis.annotate(text, (passed, y), (0, 5), textcoords="offset points", ha="center")
-
-
-def write_page(
-    path: Path, title: str, header: Sequence[str], rows: Sequence[Sequence[str]],
-    figures: Sequence[tuple[str, str]], notes: Sequence[str],
-) -> None:  # fmt: skip
-    """One HTML page without scripts: notes, the table, then the figures beside it.
-
-    Args:
-      path: page to write.
-      title: of the page.
-      header: of the table.
-      rows: of the table; a last cell of yes or no is coloured.
-      figures: (file name relative to the page, caption).
-      notes: paragraphs above the table.
-    """
-
-    def cell(text: str, tag: str = "td") -> str:
-        mark = {"yes": ' class="yes"', "no": ' class="no"'}.get(text, "")
-        return f"<{tag}{mark}>{html.escape(text)}</{tag}>"
-
-    body = [f"<h1>{html.escape(title)}</h1>", *(f"<p>{html.escape(note)}</p>" for note in notes)]
-    body.append("<table><tr>" + "".join(cell(text, "th") for text in header) + "</tr>")
-    body += ["<tr>" + "".join(cell(text) for text in row) + "</tr>" for row in rows]
-    body.append("</table>")
-    body += [
-        f'<figure><img src="{html.escape(name)}" alt="{html.escape(caption)}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-        for name, caption in figures
-    ]
-    path.write_text(
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{_CSS}</style><body>" + "\n".join(body) + "</body></html>\n",
-        encoding="utf-8",
-    )
-
-
-_CSS = (
-    "body{font:14px/1.4 sans-serif;max-width:70em;margin:2em auto;padding:0 1em}"
-    "table{border-collapse:collapse}td,th{border-bottom:1px solid #cbd5e0;padding:.25em .6em;"
-    "text-align:left}.yes{color:#2f855a}.no{color:#c53030;font-weight:bold}"
-    "img{max-width:100%}figure{margin:2em 0}"
-)
 
 
 def _commands(axis: Axes, run: Series) -> None:

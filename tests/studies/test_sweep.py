@@ -125,7 +125,7 @@ def test_a_sweep_leaves_its_cases_a_summary_and_a_figure_and_goes_on(
     assert call(sweep.main, *words) == 0
     assert len(engine.chunks) == 6  # two speeds by three seeds, none of them twice
     names = {path.name for path in (tmp_path / "out").iterdir() if not path.name.startswith(".")}
-    assert names == {"sweep.nc", "summary.json", "figure.png", "cache"}
+    assert names == {"sweep.nc", "summary.json", "figure.png", "index.html", "cache"}
     found = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert found["success"]["value"] == pytest.approx([1.0, 2 / 3], abs=1e-5)
     assert found["speed"] == [0.1, 0.3]
@@ -164,3 +164,19 @@ def test_a_mistake_is_one_line_and_exit_code_2(engine, call, capsys, file, tmp_p
     assert err.count("\n") == 1
     assert said in err
     assert engine.chunks == []
+
+
+def test_the_points_of_a_grid_and_of_a_sample_have_a_row_each():
+    metric = {"value": [[1.0, 0.5]], "low": [[0.8, 0.2]], "high": [[1.0, 0.7]]}
+    grid = {"dimensions": ["speed", "height"], "speed": [0.3], "height": [0.05, 0.1],
+            "success": metric}  # fmt: skip
+    assert sweep.points(grid) == (
+        ["speed", "height", "success"],
+        [["0.3", "0.05", "1 (0.8 to 1)"], ["0.3", "0.1", "0.5 (0.2 to 0.7)"]],
+    )
+    flat = {part: values[0] for part, values in metric.items()}
+    sample = {"dimensions": ["sample"], "speed": [0.3, 0.4], "height": [0.05, 0.1],
+              "success": flat}  # fmt: skip
+    header, rows = sweep.points(sample)
+    assert header == ["speed", "height", "success"]
+    assert rows[1] == ["0.4", "0.1", "0.5 (0.2 to 0.7)"]

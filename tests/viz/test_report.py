@@ -1,7 +1,6 @@
 """What the figures over many episodes draw is what they were given, with its units."""
 
 import dataclasses
-import html.parser
 
 import imageio.v2 as imageio
 import numpy as np
@@ -179,53 +178,3 @@ def test_limits_are_bars_from_what_passed_to_what_failed(drawn, tmp_path):
     marks = {line.get_marker(): line for line in strength.lines}
     np.testing.assert_array_equal(marks[">"].get_xydata(), [[40.0, 0]])
     np.testing.assert_array_equal(marks["|"].get_xdata(), [40.0, 42.5])
-
-
-class Page(html.parser.HTMLParser):
-    """Rows of the table with their classes, pictures, and paragraphs of a page."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.rows, self.classes, self.pictures, self.text, self.cell = [], {}, [], "", None
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        attributes = dict(attributes)
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th"):
-            self.rows[-1].append("")
-            self.cell = attributes.get("class", "")
-        if tag == "img":
-            self.pictures.append(attributes["src"])
-
-    def handle_endtag(self, tag):
-        if tag in ("td", "th"):
-            self.cell = None
-
-    def handle_data(self, data):
-        self.text += data
-        if self.cell is not None:
-            self.rows[-1][-1] += data
-            if self.cell:
-                self.classes[data] = self.cell
-
-
-def test_the_page_holds_notes_table_and_figures_and_escapes_them(tmp_path):
-    report.write_page(
-        tmp_path / "index.html",
-        "Results & more",
-        ["metric", "met"],
-        [["falls < 1", "yes"], ["RMSE", "no"]],
-        [("figures/trot.png", "trot <steps>")],
-        ["A note with a <tag>."],
-    )
-    text = (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert "<tag>" not in text
-    assert "<steps>" not in text
-    page = Page(text)
-    assert page.rows == [["metric", "met"], ["falls < 1", "yes"], ["RMSE", "no"]]
-    assert page.classes == {"yes": "yes", "no": "no"}
-    assert page.pictures == ["figures/trot.png"]
-    assert "A note with a <tag>." in page.text
-    assert "trot <steps>" in page.text

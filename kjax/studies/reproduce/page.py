@@ -34,7 +34,7 @@ NOTES = (
     f"RMSE is of the raw centre-of-mass velocity against the step command, from 0.5 s on. Its "
     f"floor is what remains if every step is answered at {ACCELERATION:g} m/s² or, second, at mu g "
     "(a step of dv at an acceleration a costs dv³/(3a)).",
-    "Times are of workers that share the machine; experiments/benchmark.py measures them alone.",
+    "Times are of workers that share the machine; kjax bench measures them alone.",
 )
 
 
@@ -47,7 +47,7 @@ def save_page(folder: Path, record: dict[str, Any], args: StudyOptions, cache: C
       args: of the command line.
       cache: of the episodes.
     """
-    from kjax.viz.report import write_page
+    from kjax.viz.page import Page, write_page
 
     rows = _table(record["experiments"])
     notes = list(NOTES)
@@ -57,7 +57,14 @@ def save_page(folder: Path, record: dict[str, Any], args: StudyOptions, cache: C
     cli.write_text(folder / "table.md", text)
     title = "Koopman LMPC for a quadruped: the paper's results, reproduced"
     figures = _figures(folder, record["experiments"], args, cache)
-    write_page(folder / "index.html", title, HEADER, rows, figures, notes)
+    write_page(
+        folder / "index.html",
+        Page(
+            title=title, notes=notes, header=HEADER, rows=rows,
+            figures=[(folder / name, caption) for name, caption in figures],
+            provenance=record["provenance"],
+        ),
+    )  # fmt: skip
 
 
 def _table(experiments: dict[str, Any]) -> list[list[str]]:
