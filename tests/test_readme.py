@@ -21,7 +21,8 @@ from kjax.sim.resolve import build_scene
 
 PAGES = ("README.md", *(f"docs/{name}.md" for name in (
     "index", "install", "first_walk", "your_own_loop", "gaits", "models", "qp", "sweeps", "tuning",
-    "threads", "results", "reproduction", "benchmarks", "conventions", "faq", "changelog",
+    "threads", "results", "reproduction", "benchmarks", "notebooks", "conventions", "faq",
+    "changelog",
     "contributing",
 )))  # fmt: skip
 
