@@ -22,7 +22,9 @@ from kjax import RunConfig, load_config  # noqa: E402
 from kjax.robots import get_robot  # noqa: E402
 from kjax.tuning import loop, optimise, space  # noqa: E402
 
-config = load_config(RunConfig, "configs/bound_velocity_short.toml", {"duration": 1.2})
+# Forces in a box, as in the paper: friction and torque rows make the gradient's compilation longer.
+box = {"lmpc.friction": float("inf"), "lmpc.torque_fraction": float("inf")}
+config = load_config(RunConfig, "configs/bound_velocity_short.toml", {"duration": 1.2, **box})
 keys = ["gaits.bound.Q", "gaits.bound.R", "gaits.bound.foothold_gain"]
 search_space = space.build_space(config, keys)
 print(
@@ -115,5 +117,5 @@ plt.show()
 # %% [markdown]
 # What the rigid body likes need not be what the robot likes: here friction takes what a foot cannot
 # hold, and the foot stays; in MuJoCo it flies away. With `lmpc.friction` as rows of the QP neither
-# happens, and what is tuned here works there. `experiments/tune.py` ends with the verdict in
+# happens, and what is tuned here works there. `kjax tune` ends with the verdict in
 # MuJoCo, beside CMA-ES in MuJoCo itself for the same time.

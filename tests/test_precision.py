@@ -18,6 +18,15 @@ from kjax.robots import go1
 EXACT = (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)
 
 
+@pytest.fixture(autouse=True)
+def _the_default_of_a_reader():
+    """Without what ``cli.configure_jax`` may have set in this process before."""
+    before = jax.config.jax_default_matmul_precision
+    jax.config.update("jax_default_matmul_precision", None)
+    yield
+    jax.config.update("jax_default_matmul_precision", before)
+
+
 def products(jaxpr):
     """Precision of every dot_general of a jaxpr, inner ones included."""
     for equation in jaxpr.eqns:

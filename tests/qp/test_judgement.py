@@ -15,7 +15,24 @@ from kjax import qp
 from kjax.qp import MethodUsed, Status
 
 INF = np.inf
-solve = jax.jit(qp.solve_rows, static_argnames=("method", "tolerance", "max_iterations"))
+N, M = 6, 8  # variables and rows that every problem is filled up to, so that few are compiled
+compiled = jax.jit(qp.solve_rows, static_argnames=("method",))
+
+
+def solve(H, q, C, low, high, lower, upper, warm=None, *, method="auto"):
+    """``qp.solve_rows`` of the problem with variables fixed at 0 and rows without bounds added."""
+    traced = any(isinstance(a, jax.core.Tracer) for a in (H, q))
+    xp, (m, n) = jnp if traced else np, np.shape(C)
+    H, q, C, low, high, lower, upper = map(xp.asarray, (H, q, C, low, high, lower, upper))
+    rest = np.arange(N) >= n
+    # As curved as the rest of H is: a linear program stays one.
+    wide = xp.pad(H, (0, N - n)) + xp.trace(H) / n * np.diag(rest).astype(H.dtype)
+    low, high = (xp.pad(a, (0, M - m), constant_values=s) for a, s in ((low, -INF), (high, INF)))
+    q, lower, upper = (xp.pad(a, (0, N - n)) for a in (q, lower, upper))
+    C = xp.pad(C, ((0, M - m), (0, N - n)))
+    solution = compiled(wide, q, C, low, high, lower, upper, warm, method=method)
+    x, y = (a if traced else np.asarray(a) for a in (solution.x, solution.multipliers))
+    return solution._replace(x=x[:n], multipliers=xp.concatenate([y[:m], y[M : M + n]]))
 
 
 @pytest.fixture(params=qp.ROW_METHODS)

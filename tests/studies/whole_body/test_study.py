@@ -124,8 +124,8 @@ def test_ctrl_c_keeps_what_is_recorded(studied, call, capsys, tmp_path):
     ("words", "said"),
     [
         (["--robots", 9], "--robots: got 9, wanted at least 10"),
-        (["--duration", 2.5], "--duration: got 2.5 s, wanted at least 3 s"),
-        (["--force", 0], "--force: got 0.0 N, wanted more than 0"),
+        (["--duration", 2.5], "--duration: got 2.5, wanted at least 3"),
+        (["--force", 0], "--force: got 0.0, wanted more than 0"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(studied, call, capsys, tmp_path, words, said):
