@@ -13,7 +13,9 @@ from kjax.moved import MOVED, NAMES
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_every_subpackage_and_the_mjcf(repository, tmp_path):
+def test_the_wheel_holds_every_subpackage_the_mjcf_the_configs_and_the_command(
+    repository, tmp_path
+):
     subprocess.run(
         [sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", tmp_path, repository],
         check=True,
@@ -24,10 +26,17 @@ def test_the_wheel_holds_every_subpackage_and_the_mjcf(repository, tmp_path):
     sources = {
         str(path.relative_to(repository))
         for path in (repository / "kjax").rglob("*")
-        if path.suffix in {".py", ".xml"} or path.name == "py.typed"
+        if path.suffix in {".py", ".xml", ".jinja"} or path.name == "py.typed"
     }
     assert sources <= inside
     assert "kjax/robots/go1.xml" in inside
+    shipped = {
+        f"kjax/{path.relative_to(repository)}" for path in (repository / "configs").rglob("*.toml")
+    }
+    assert len(shipped) > 20
+    assert shipped <= inside
+    scripts = next(name for name in inside if name.endswith("entry_points.txt"))
+    assert "kjax = kjax.commands.main:start" in zipfile.ZipFile(wheel).read(scripts).decode()
 
 
 def test_a_public_name_that_has_gone_gives_the_new_one():

@@ -170,7 +170,10 @@ def cast(tree: Any, dtype: Any) -> Any:
 
 def _as(leaf: Any, dtype: Any) -> Array:
     """Leaf on the device: floats in ``dtype``, integers as int32, the rest as it is."""
-    kind = jnp.asarray(leaf).dtype
-    if jnp.issubdtype(kind, jnp.floating):
-        return jnp.asarray(leaf, dtype)
-    return jnp.asarray(leaf, jnp.int32) if jnp.issubdtype(kind, jnp.integer) else jnp.asarray(leaf)
+    # NumPy casts what is known without compiling a program for every shape.
+    array = np.asarray(leaf) if is_concrete(leaf) else jnp.asarray(leaf)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return jnp.asarray(array.astype(dtype))
+    if jnp.issubdtype(array.dtype, jnp.integer):
+        return jnp.asarray(array.astype(np.int32))
+    return jnp.asarray(array)
