@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup trot trot-long fit reproduce envelope test test-fast check docs notebooks benchmark clean
+.PHONY: setup trot trot-long fit reproduce envelope test test-fast check docs refresh notebooks benchmark clean
 
 setup: $(STAMP)
 
@@ -39,8 +39,10 @@ test-fast: setup  ## without the slow tests
 	$(PYTEST) -m "not slow"
 
 docs: setup  ## the site, in docs/_build/html; warnings are errors
-	$(BIN)/python docs/refresh.py
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
+
+refresh: setup  ## the tables of README and docs again, from docs/results
+	$(BIN)/python docs/refresh.py
 
 notebooks: setup  ## run the notebooks and leave their executed twins in docs/notebooks
 	$(BIN)/python docs/refresh.py --notebooks

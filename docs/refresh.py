@@ -136,6 +136,21 @@ def readme_speed() -> str:
 
 
 @table
+def first_minutes() -> str:
+    """What a newcomer waits for."""
+    found = load("benchmark_controller")
+    return markdown(
+        ("in the first ten minutes", "takes"),
+        [
+            ("`kjax run trot_velocity`, the first time (22 s of walking; compiles)",
+             f"{found['first_run_s']:.0f} s"),
+            ("again", f"{found['second_run_s']:.0f} s"),
+            ("measured", recorded("benchmark_controller")),
+        ],
+    )  # fmt: skip
+
+
+@table
 def walks() -> str:
     """Gaits, rough ground and switches: both bases beside the paper."""
     got = Reproduced()

@@ -55,8 +55,8 @@ def part(name: str) -> str:
     """What the module's head says of a benchmark."""
     text = " ".join(__doc__.split())
     begin = text.index(f" {name}: ") + 1
-    ends = [text.find(f" {other}: ", begin) for other in BENCHMARKS]
-    return text[begin : min((end for end in ends if end > 0), default=len(text))]
+    others = [text.find(f" {other}: ", begin) for other in BENCHMARKS]
+    return text[begin : min((end for end in others if end > 0), default=len(text))]
 
 
 def controller_benchmark(words: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""``kjax doctor``: what this installation has, what it misses, and the command that mends it."""
+"""``kjax doctor``: what this installation has, what it misses, and the command that remedies it."""
 
 import importlib.metadata
 import importlib.util
@@ -34,22 +34,22 @@ _DRAW = (
 
 
 class Finding(NamedTuple):
-    """A line of the report: what was looked at, what was found, and what mends it, if anything."""
+    """A line of the report: what was looked at, what was found, and the remedy, if anything."""
 
     what: str
     found: str
-    mend: str = ""
+    remedy: str = ""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the report; exit code 1 if something that ``kjax run`` needs is missing."""
-    parse(Options, argv, "What this installation has, what it misses, and what mends it.")
+    parse(Options, argv, "What this installation has, what it misses, and the remedy.")
     needed = True
     for finding in findings():
         print(f"{finding.what:16} {finding.found}")
-        if finding.mend:
-            needed = needed and not finding.mend.startswith("pip install 'kjax[sim")
-            print(f"{'':16} -> {finding.mend}")
+        if finding.remedy:
+            needed = needed and not finding.remedy.startswith("pip install 'kjax[sim")
+            print(f"{'':16} -> {finding.remedy}")
     return 0 if needed else 1
 
 

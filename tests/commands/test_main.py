@@ -128,7 +128,7 @@ def test_doctor_reports_a_whole_installation(call, capsys, quick, monkeypatch):
     assert "NPROC = 1" in out
 
 
-def test_doctor_says_what_is_missing_and_what_mends_it(call, capsys, quick, monkeypatch):
+def test_doctor_says_what_is_missing_and_the_remedy(call, capsys, quick, monkeypatch):
     version = doctor.importlib.metadata.version
 
     def without(name):
@@ -159,4 +159,4 @@ def test_a_renderer_that_fails_is_passed_over(monkeypatch):
     monkeypatch.setattr(
         doctor.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=1, stdout="")
     )
-    assert doctor.graphics().mend.startswith("install a renderer")
+    assert doctor.graphics().remedy.startswith("install a renderer")
