@@ -19,7 +19,10 @@ import jax
 import tomli_w
 
 from kjax.config import ConfigError, to_dict
+from kjax.moved import moved_names
 from kjax.options import Options, fail
+
+__getattr__ = moved_names(__name__)
 
 _PACKAGES = ("kjax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 

@@ -36,6 +36,14 @@ MOVED = {
 _GAIT = "kjax.config.gaits.LIBRARY['{}']: gaits are data, their phases gait.phases(...)"
 # Module -> old name -> what to use now.
 NAMES = {
+    "kjax.cli": {
+        "build_parser": "a dataclass of kjax.options.RunOptions and parse_config",
+        "script_parser": "a dataclass of kjax.options.Options and parse",
+        "parse_study": "a dataclass of kjax.options.StudyOptions and parse",
+        "parse": "kjax.options.parse_config",
+        "require": "kjax.options.require",
+    },
+    "kjax.viz.report": {"write_page": "kjax.viz.page.write_page"},
     "kjax": {"build_params": "resolve(config, robot), then condense(spec, params)"},
     "kjax.config": {"BoundConfig": "GaitConfig, and config.gaits.LIBRARY['bound']: gaits are data"},
     "kjax.gait": {name: _GAIT.format(name) for name in ("trot", "bound", "stand")},

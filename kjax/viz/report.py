@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
 from kjax.config import RunConfig
+from kjax.moved import moved_names
 from kjax.sim.resolve import resolve_field
 from kjax.sim.series import Series
 from kjax.sim.terrain import generate, shapes
@@ -24,6 +25,8 @@ from kjax.viz.plots import (
     moving_mean,
     zoom_window,
 )
+
+__getattr__ = moved_names(__name__)
 
 _BEFORE, _AFTER = 0.5, 2.0  # s about a switch
 _THIN = {"color": GREY, "lw": 0.4, "alpha": 0.6}
