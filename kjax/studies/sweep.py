@@ -184,12 +184,12 @@ def report(dataset: Any, sweep: SweepConfig, folder: Path) -> None:
         **sweep_summary(dataset, sweep),
     }
     cli.save_json(folder / "summary.json", record)
-    save_page(folder, record, [summary_line(dataset)])
+    save_page(folder, record, [summary_line(dataset)], drawn=sweep.figure is not None)
     print(summary_line(dataset))
 
 
-def save_page(folder: Path, record: dict[str, Any], notes: list[str]) -> None:
-    """The finished sweep as one file: figure, and a row for each of its points."""
+def save_page(folder: Path, record: dict[str, Any], notes: list[str], *, drawn: bool) -> None:
+    """The finished sweep as one file: its figure if it asks for one, a row for each point."""
     from kjax.viz.page import Page, write_page
 
     header, rows = points(record)
@@ -197,7 +197,7 @@ def save_page(folder: Path, record: dict[str, Any], notes: list[str]) -> None:
     notes = [*notes, f"{count} episodes at each point; in parentheses the 95 % interval."]
     page = Page(
         title=f"Sweep {folder.name}", notes=notes, header=header, rows=rows,
-        figures=[(folder / "figure.png", "What the sweep found")],
+        figures=[(folder / "figure.png", "What the sweep found")] if drawn else [],
         provenance=record["provenance"],
     )  # fmt: skip
     write_page(folder / "index.html", page)

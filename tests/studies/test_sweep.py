@@ -180,3 +180,16 @@ def test_the_points_of_a_grid_and_of_a_sample_have_a_row_each():
     header, rows = sweep.points(sample)
     assert header == ["speed", "height", "success"]
     assert rows[1] == ["0.4", "0.1", "0.5 (0.2 to 0.7)"]
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_the_page_of_a_sweep_has_a_figure_only_if_it_asks_for_one(tmp_path, drawn):
+    record = {"dimensions": ["speed"], "speed": [0.3], "episodes_per_point": 2,
+              "success": {"value": [1.0], "low": [0.8], "high": [1.0]},
+              "provenance": {"git_revision": "abc"}}  # fmt: skip
+    if drawn:
+        (tmp_path / "figure.png").write_bytes(b"a picture")
+    sweep.save_page(tmp_path, record, ["2 episodes"], drawn=drawn)
+    text = (tmp_path / "index.html").read_text()
+    assert ("<img" in text) is drawn
+    assert "<td>1 (0.8 to 1)</td>" in text
