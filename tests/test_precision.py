@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kjax import Observation, RunConfig, build_controller, condense, load_config, qp, resolve
+from kjax import RunConfig, build_controller, condense, load_config, qp, resolve
 from kjax.koopman import edmd, observables
 from kjax.koopman.dataset import Snapshots
-from kjax.legs.posture import stand_pose
+from kjax.legs.posture import stand_pose, standing
 from kjax.qp.batching import CHUNK
 from kjax.robots import go1
 
@@ -36,7 +36,7 @@ def products(jaxpr):
             yield from products(inner)
 
 
-def require_exact(function, *args):
+def assert_exact(function, *args):
     found = list(products(jax.make_jaxpr(function)(*args).jaxpr))
     assert found, "no product at all"
     assert all(precision == EXACT for precision in found)
@@ -44,33 +44,21 @@ def require_exact(function, *args):
 
 def test_the_walk_finds_a_product_of_default_precision():
     with pytest.raises(AssertionError):
-        require_exact(jax.jit(lambda a: a @ a), jnp.eye(3))
-
-
-def standing():
-    height, joints = stand_pose(go1.PARAMS, 0.27)
-    return Observation(
-        base_pos=jnp.array([0.0, 0.0, height]),
-        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
-        base_vel=jnp.zeros(3),
-        base_ang_vel=jnp.zeros(3),
-        joint_pos=jnp.asarray(joints),
-        joint_vel=jnp.zeros((4, 3)),
-        contact=jnp.ones(4, bool),
-    )
+        assert_exact(jax.jit(lambda a: a @ a), jnp.eye(3))
 
 
 @pytest.mark.parametrize("base", ["free", "planar"])
 def test_controller(base):
     spec, params = resolve(load_config(RunConfig, None, {"sim.base": base}))
     controller, tables = build_controller(spec), condense(spec, params)
-    seen = standing()
+    height, joints = stand_pose(go1.PARAMS, 0.27)
+    seen = standing(joints)._replace(base_pos=jnp.array([0.0, 0.0, height]))
     state = controller.init(tables, seen)
-    require_exact(controller.plan, tables, state, seen)
-    require_exact(controller.act, tables, state, seen)
+    assert_exact(controller.plan, tables, state, seen)
+    assert_exact(controller.act, tables, state, seen)
     many = jax.tree.map(lambda a: jnp.stack([a] * (2 * CHUNK)), (state, seen))
-    require_exact(jax.vmap(jax.jit(controller.plan), (None, 0, 0)), tables, *many)
-    require_exact(jax.jit(partial(condense, spec)), params)
+    assert_exact(jax.vmap(jax.jit(controller.plan), (None, 0, 0)), tables, *many)
+    assert_exact(jax.jit(partial(condense, spec)), params)
 
 
 def problem(n=6):
@@ -83,11 +71,11 @@ def test_box_and_its_derivative(method):
     def value(H, q, lower, upper):
         return qp.solve(qp.prepare(H), q, lower, upper, method=method).x.sum()
 
-    require_exact(value, *problem())
-    require_exact(jax.grad(value), *problem())
+    assert_exact(value, *problem())
+    assert_exact(jax.grad(value), *problem())
     many = [np.stack([a] * (2 * CHUNK)) for a in problem()]
-    require_exact(jax.vmap(jax.jit(value)), *many)
-    require_exact(jax.vmap(jax.grad(jax.jit(value))), *many)
+    assert_exact(jax.vmap(jax.jit(value)), *many)
+    assert_exact(jax.vmap(jax.grad(jax.jit(value))), *many)
 
 
 @pytest.mark.parametrize("method", qp.ROW_METHODS)
@@ -96,12 +84,12 @@ def test_rows_and_their_derivative(method):
         C, side = jnp.ones((1, len(q))), jnp.ones(1)
         return qp.solve_rows(H, q, C, -side, side, lower, upper, method=method).x.sum()
 
-    require_exact(value, *problem())
+    assert_exact(value, *problem())
     many = [np.stack([a] * (2 * CHUNK)) for a in problem()]
-    require_exact(jax.vmap(jax.grad(jax.jit(value))), *many)
+    assert_exact(jax.vmap(jax.grad(jax.jit(value))), *many)
 
 
 def test_fit():
     rng = np.random.default_rng(0)
     data = Snapshots(rng.normal(size=(40, 6, 6)), rng.normal(size=(40, 5, 4)), np.zeros((40, 2, 2)))
-    require_exact(lambda data: edmd.fit(observables.paper(2), data)[0], data)
+    assert_exact(lambda data: edmd.fit(observables.paper(2), data)[0], data)
