@@ -21,6 +21,7 @@ import tomli_w
 from kjax.config import ConfigError, to_dict
 from kjax.moved import moved_names
 from kjax.options import Options, fail
+from kjax.threads import one_blas_thread
 
 __getattr__ = moved_names(__name__)
 
@@ -70,6 +71,7 @@ def configure_jax(
     # spreads a batch of LAPACK calls over the pool that it runs them in, and waits: with as many of
     # these at once as the pool has threads, nothing moves any more. So make it one or many.
     os.environ.setdefault("NPROC", str(max(8, 4 * (os.cpu_count() or 1))) if parallel else "1")
+    one_blas_thread()
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     jax.config.update("jax_default_matmul_precision", "highest")  # MJX's too: no TF32 on a GPU

@@ -7,6 +7,7 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("NPROC", "1")  # see kjax.cli.configure_jax
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see kjax.threads
 # Compiling is most of the time, and LLVM's optimisations cost a third of it. Scripts that tests
 # start run for longer, and get what users get.
 given = os.environ.get("XLA_FLAGS")

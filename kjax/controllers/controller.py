@@ -14,12 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from kjax import gait, qp
+from kjax.concrete import is_concrete
 from kjax.controllers.acting import build_act, facing
 from kjax.controllers.command import IGNORED
 from kjax.controllers.observation import (
     cast,
     check_observation,
-    is_concrete,
     is_valid,
     or_neutral,
 )

@@ -80,11 +80,6 @@ def or_neutral(observation: Observation, valid: Bool[Array, ""]) -> Observation:
     )
 
 
-def is_concrete(tree: Any) -> bool:
-    """Whether all values are concrete: none is traced by ``jit``, ``vmap`` or ``grad``."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
-
-
 def check_shapes(observation: Observation) -> None:
     """Raise a ValueError for a field of the wrong shape or type."""
     for name, wanted in SHAPES.items():
@@ -130,7 +125,8 @@ def check_observation(robot: RobotParams, observation: Observation) -> None:
     _check_rates(values)
     _check_joints(robot, joints)
     with jax.ensure_compile_time_eval():  # also where the caller traces, with constants
-        _check_feet(robot, quat, joints, values["contact"] > 0)
+        foot, rotation = jax.device_get(_standing_feet(robot, joints, quat))
+        _check_feet(robot, foot, rotation, values["contact"] > 0)
 
 
 def _check_quaternion(quat: np.ndarray) -> None:
@@ -195,12 +191,18 @@ def _check_joints(robot: RobotParams, joints: np.ndarray) -> None:
         )
 
 
+@jax.jit
+def _standing_feet(robot: RobotParams, joints: Array, quat: Array) -> tuple[Array, Array]:
+    """Feet (4, 3) from their hips, trunk axes [m], and the trunk's rotation (3, 3)."""
+    trig = kinematics.leg_trig(joints)
+    return spatial.foot_position(robot, spatial.hip_trig(joints), trig), spatial.rotation_matrix(
+        quat
+    )
+
+
 def _check_feet(
-    robot: RobotParams, quat: np.ndarray, joints: np.ndarray, contact: np.ndarray
+    robot: RobotParams, foot: np.ndarray, rotation: np.ndarray, contact: np.ndarray
 ) -> None:
-    trig = kinematics.leg_trig(jnp.asarray(joints))
-    lever = spatial.foot_position(robot, spatial.hip_trig(jnp.asarray(joints)), trig)
-    foot = np.asarray(lever)
     side = np.asarray(robot.abduction_offset)
     away = np.hypot(foot[:, 0], foot[:, 1] - side)
     length = float(robot.thigh_length + robot.calf_length)
@@ -211,7 +213,6 @@ def _check_feet(
             "a robot that stands; do abduction or thigh have the other sign, or are joints or "
             "legs in another order (FR, FL, RR, RL by abduction, thigh, calf)?"
         )
-    rotation = np.asarray(spatial.rotation_matrix(jnp.asarray(quat)))
     height = ((foot + np.asarray(robot.hip_pos)) @ rotation.T)[:, 2]
     if contact.any() and not contact.all():
         high, low = height[contact].max(), height[~contact].min()

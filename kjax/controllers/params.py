@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from kjax import gait
-from kjax.controllers.observation import is_concrete
+from kjax.concrete import is_concrete
 from kjax.koopman.models import LinearModel
 from kjax.legs import lateral, swing
 from kjax.mpc import horizon
@@ -165,15 +165,15 @@ def _as_float64(leaf: Any) -> np.ndarray:
 
 def cast(tree: Any, dtype: Any) -> Any:
     """Arrays on the device, floats in ``dtype``, integers as int32."""
-    return jax.tree.map(lambda leaf: _as(leaf, dtype), tree)
+    return jax.device_put(jax.tree.map(lambda leaf: _as(leaf, dtype), tree))
 
 
-def _as(leaf: Any, dtype: Any) -> Array:
-    """Leaf on the device: floats in ``dtype``, integers as int32, the rest as it is."""
+def _as(leaf: Any, dtype: Any) -> Array | np.ndarray:
+    """A copy of the leaf: floats in ``dtype``, integers as int32, the rest as it is."""
     # NumPy casts what is known without compiling a program for every shape.
-    array = np.asarray(leaf) if is_concrete(leaf) else jnp.asarray(leaf)
+    array = np.array(leaf) if is_concrete(leaf) else jnp.asarray(leaf)
     if jnp.issubdtype(array.dtype, jnp.floating):
-        return jnp.asarray(array.astype(dtype))
+        return array.astype(dtype)
     if jnp.issubdtype(array.dtype, jnp.integer):
-        return jnp.asarray(array.astype(np.int32))
-    return jnp.asarray(array)
+        return array.astype(np.int32)
+    return array

@@ -8,11 +8,11 @@ from math import inf
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from kjax import gait
+from kjax.concrete import array_library, stacked
 from kjax.config import CommandConfig, Overlay, RunConfig
 from kjax.config.gaits import gait_setting, reachable_gaits
 from kjax.config.units import InSi, in_si
@@ -27,6 +27,7 @@ from kjax.controllers.walkable import (
     cycle_nodes,
 )
 from kjax.gait.reference import SAMPLES, periodic_reference
+from kjax.gait.schedule import schedule_arrays
 from kjax.koopman.edmd import Point, fit_modes, stack_bodies
 from kjax.legs import lateral, swing
 from kjax.mpc import horizon
@@ -36,6 +37,7 @@ from kjax.prediction.evaluation import force_response_error
 from kjax.prediction.kind import ModelChoice, get_kind
 from kjax.robots import get_robot
 from kjax.spec import ControllerSpec, CycleSpec
+from kjax.threads import one_blas_thread
 from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
 
 
@@ -162,11 +164,18 @@ def _fit(
 ) -> Fits:
     body = stack_bodies(mass, inertia, feet)
     key = jax.random.key(seed)
-    model, report = _fit_modes(
-        body, key, modes=modes,
-        dictionary=choice.dictionary, dataset=choice.dataset, measured_feet=choice.measured_feet,
-    )  # fmt: skip
-    if not bool(report.finite.all()):
+    with one_blas_thread():
+        model, report = jax.device_get(
+            _fit_modes(
+                body,
+                key,
+                modes=modes,
+                dictionary=choice.dictionary,
+                dataset=choice.dataset,
+                measured_feet=choice.measured_feet,
+            )
+        )
+    if not report.finite.all():
         raise ValueError("dataset: the EDMD fit is not finite, check its ranges and srb")
     prediction = None
     if get_kind(choice.model).params is not None:
@@ -215,55 +224,54 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
     uses_gait_cycle = cycle_nodes(gaits, si).any(axis=1)
     problems, index = contact_problems(gaits, si)
 
+    known: dict[str, Any] = {
+        "problem": index,
+        "gaits": np.asarray([names.index(name) for name in si.gait.names]),
+    }
     return ControllerParams(
+        **known,
         robot=robot,
         fits=fits,
         modes=problem_settings(si, problems, names, mean_force(gaits, si, robot)),
-        problem=jnp.asarray(index),
-        uncertainty_discount=jnp.asarray(si.lmpc.uncertainty_discount, float),
-        friction=jnp.asarray(si.lmpc.friction, float),
-        torque_fraction=jnp.asarray(si.lmpc.torque_fraction, float),
-        schedule=gait.build_schedule(gaits),
-        gait_times=jnp.asarray(si.gait.times),
-        gaits=jnp.asarray([names.index(name) for name in si.gait.names]),
+        uncertainty_discount=_number(si.lmpc.uncertainty_discount),
+        friction=_number(si.lmpc.friction),
+        torque_fraction=_number(si.lmpc.torque_fraction),
+        schedule=schedule_arrays(gaits),
+        gait_times=_number(si.gait.times),
         reference=_reference_tables(gaits, si, robot),
         multiphase=multiphase_params(gaits, si, robot),
         swing=swing.SwingParams(
             apex=_column(si, names, "swing_height"),
             velocity_gain=_column(si, names, "foothold_gain"),
-            offset=jnp.stack([_foothold_offset(robot, si.gaits[name]) for name in names]),
-            horizontal_fraction=jnp.asarray(leg.horizontal_fraction),
-            hold_after=jnp.asarray(leg.hold_after),
-            reach_speed=jnp.asarray(leg.reach_speed),
-            kp=jnp.asarray([leg.abduction_kp, leg.swing_kp, leg.swing_kp]),
-            kd=jnp.asarray([leg.abduction_kd, leg.swing_kd, leg.swing_kd]),
+            offset=stacked([_foothold_offset(robot, si.gaits[name]) for name in names]),
+            horizontal_fraction=_number(leg.horizontal_fraction),
+            hold_after=_number(leg.hold_after),
+            reach_speed=_number(leg.reach_speed),
+            kp=stacked([leg.abduction_kp, leg.swing_kp, leg.swing_kp]),
+            kd=stacked([leg.abduction_kd, leg.swing_kd, leg.swing_kd]),
         ),
         lateral=lateral.LateralParams(
-            roll=jnp.asarray([sideways.roll_kp, sideways.roll_kd]),
-            yaw=jnp.asarray([sideways.yaw_kp, sideways.yaw_kd]),
-            damping=jnp.asarray(sideways.sideways_kd),
-            weights=jnp.asarray(sideways.wrench_cost),
-            ridge=jnp.asarray(sideways.force_weight),
-            friction=jnp.minimum(
-                sideways.friction,
-                jnp.where(uses_gait_cycle, si.multiphase.friction, si.lmpc.friction),
+            roll=stacked([sideways.roll_kp, sideways.roll_kd]),
+            yaw=stacked([sideways.yaw_kp, sideways.yaw_kd]),
+            damping=_number(sideways.sideways_kd),
+            weights=_number(sideways.wrench_cost),
+            ridge=_number(sideways.force_weight),
+            friction=_smaller(
+                sideways.friction, uses_gait_cycle, si.multiphase.friction, si.lmpc.friction
             ),
-            torque_fraction=jnp.minimum(
-                1.0,
-                jnp.where(uses_gait_cycle, si.multiphase.torque_fraction, si.lmpc.torque_fraction),
+            torque_fraction=_smaller(
+                1.0, uses_gait_cycle, si.multiphase.torque_fraction, si.lmpc.torque_fraction
             ),
-            foothold_gain=jnp.asarray(sideways.foothold_gain),
+            foothold_gain=_number(sideways.foothold_gain),
         ),
         command=build_command(si.command),
         height=_column(si, names, "body_height"),
-        command_slew=jnp.asarray(si.lmpc.command_slew, float),
-        height_slew=jnp.asarray(si.lmpc.height_slew, float),
-        integral=jnp.stack(
-            [jnp.asarray(si.lmpc.integral_gains), jnp.asarray(si.lmpc.integral_limits)]
-        ),
-        position_slack=jnp.asarray(si.lmpc.position_slack),
-        hold_time=jnp.asarray(leg.hold_time),
-        blind_damping=jnp.asarray(leg.blind_kd),
+        command_slew=_number(si.lmpc.command_slew),
+        height_slew=_number(si.lmpc.height_slew),
+        integral=stacked([si.lmpc.integral_gains, si.lmpc.integral_limits]),
+        position_slack=_number(si.lmpc.position_slack),
+        hold_time=_number(leg.hold_time),
+        blind_damping=_number(leg.blind_kd),
     )
 
 
@@ -279,7 +287,18 @@ _fit_modes = jax.jit(fit_modes, static_argnames=("dictionary", "dataset", "measu
 
 def _column(config: InSi, names: Sequence[str], key: str) -> Array:
     """One setting of several gaits, stacked."""
-    return jnp.stack([jnp.asarray(gait_setting(config, name, key), float) for name in names])
+    return stacked([gait_setting(config, name, key) for name in names])
+
+
+def _number(value: Any) -> Array:
+    """A value, or several, of a config as floats."""
+    return array_library(value).asarray(value, float)
+
+
+def _smaller(limit: Any, where: Any, one: Any, other: Any) -> Array:
+    """The limit, or one of two others if that is smaller."""
+    xp = array_library(limit, one, other)
+    return xp.minimum(limit, xp.where(where, one, other))
 
 
 def problem_settings(
@@ -300,21 +319,26 @@ def problem_settings(
 
     own = [names[problem.gait] for problem in problems]
 
-    def pair(x: Array, z: Array) -> Array:
-        return jnp.tile(jnp.stack([x, z], axis=-1), 2)
+    def standing_only(x: Array, z: Array) -> Array:
+        xp = array_library(x, z)
+        return xp.where(standing, xp.tile(xp.stack([x, z], axis=-1), 2), 0.0)
 
-    force = mean_force[np.array([problem.gait for problem in problems])]
-    hover = jnp.stack([jnp.zeros_like(force), force], axis=-1).reshape(len(problems), 4)
     lower, upper = (
-        pair(sign * _column(config, own, "grf_x_max"), _column(config, own, f"grf_z_{end}"))
+        standing_only(
+            sign * _column(config, own, "grf_x_max"), _column(config, own, f"grf_z_{end}")
+        )
         for sign, end in ((-1.0, "min"), (1.0, "max"))
     )
+    xp = array_library(mean_force)
+    force = mean_force[np.array([problem.gait for problem in problems])]
+    hover = xp.stack([xp.zeros_like(force), force], axis=-1).reshape(len(problems), 4)
+    weights = _column(config, own, "R")
     return ModeSettings(
         state_weights=_column(config, own, "Q"),
-        input_weights=jnp.tile(_column(config, own, "R")[:, None], 4),
-        lower=jnp.where(standing, lower, 0.0),
-        upper=jnp.where(standing, upper, 0.0),
-        input_reference=jnp.where(standing, hover, 0.0),
+        input_weights=array_library(weights).tile(weights[:, None], 4),
+        lower=lower,
+        upper=upper,
+        input_reference=xp.where(standing, hover, 0.0),
     )
 
 
@@ -327,33 +351,38 @@ def multiphase_params(
 
     names = [one.name for one in gaits]
     arms = [levers(config.gaits[name], robot) for name in names]
-    feet = [jnp.stack([jnp.asarray(x, float) for x in (front, -rear)]) for front, rear in arms]
+    limit = robot.torque_limit[1:]
+    nodes: Any = cycle_nodes(gaits, config)
     return horizon.MultiPhaseParams(
-        nodes=jnp.asarray(cycle_nodes(gaits, config)),
+        nodes=nodes,
         state_weights=_column(config, names, "Q"),
         input_weight=_column(config, names, "R"),
-        mass=jnp.asarray(mass),
-        inertia=jnp.asarray(inertia * chosen.inertia_scale),
-        friction=jnp.asarray(chosen.friction),
-        torque_limit=jnp.asarray(chosen.torque_fraction * robot.torque_limit[1:]),
+        mass=_number(mass),
+        inertia=_number(inertia * chosen.inertia_scale),
+        friction=_number(chosen.friction),
+        torque_limit=_number(chosen.torque_fraction * limit),
         force_x_max=_column(config, names, "grf_x_max"),
-        force_z=jnp.stack(
-            [_column(config, names, "grf_z_min"), _column(config, names, "grf_z_max")], axis=-1
+        force_z=stacked(
+            [
+                [gait_setting(config, name, key) for key in ("grf_z_min", "grf_z_max")]
+                for name in names
+            ]
         ),
-        feet=jnp.stack(feet),
+        feet=stacked([[front, -rear] for front, rear in arms]),
         velocity_gain=_column(config, names, "foothold_gain"),
-        velocity_time=jnp.asarray(chosen.velocity_time),
-        height_time=jnp.asarray(chosen.height_time),
+        velocity_time=_number(chosen.velocity_time),
+        height_time=_number(chosen.height_time),
     )
 
 
 def _reference_tables(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> Array:
     """Periodic motion of every gait at every ramp level; zero where the reference is constant."""
     mass, inertia = body_numbers(config, robot)
-    levels = 1 + max(g.ramp_cycles for g in gaits)
-    rows = jnp.zeros((len(gaits), levels, max(len(g.phases) for g in gaits), SAMPLES, 4))
-    for index, one in enumerate(gaits):
+    levels, phases = 1 + max(g.ramp_cycles for g in gaits), max(len(g.phases) for g in gaits)
+    rows: list[Any] = []
+    for one in gaits:
         own = config.gaits[one.name]
+        rows.append(np.zeros((levels, phases, SAMPLES, 4)))
         if own.reference != "periodic":
             continue
         modes = [contact_mode(phase.stance) for phase in one.phases]
@@ -368,13 +397,13 @@ def _reference_tables(gaits: list[gait.Gait], config: InSi, robot: RobotParams) 
             ).rows
             for level in range(levels)
         ]
-        rows = rows.at[index, :, : len(modes)].set(jnp.stack(cycles))
-    return rows
+        xp = array_library(cycles)
+        rows[-1] = xp.pad(xp.stack(cycles), [(0, 0), (0, phases - len(modes)), (0, 0), (0, 0)])
+    return stacked(rows)
 
 
 def _foothold_offset(robot: RobotParams, own: Any) -> Array:
     """Foothold of a gait ahead of the hip, standing still, for each leg [m]."""
     if own.foothold_front is None:
-        return jnp.zeros(4)
-    wanted = [own.foothold_front] * 2 + [-own.foothold_rear] * 2
-    return jnp.stack([jnp.asarray(one, float) for one in wanted]) - robot.hip_pos[:, 0]
+        return stacked(np.zeros(4))
+    return stacked([own.foothold_front] * 2 + [-own.foothold_rear] * 2) - robot.hip_pos[:, 0]

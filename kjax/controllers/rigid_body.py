@@ -2,10 +2,10 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from kjax.concrete import stacked
 from kjax.config import Overlay, RunConfig, SrbConfig
 from kjax.config.units import InSi
 from kjax.dynamics.srb_planar import SrbParams
@@ -49,7 +49,7 @@ def levers(own: InSi, robot: RobotParams) -> tuple[Any, Any]:
     Below the hips both count as the hips' mean, so that the ends share the weight alike.
     """
     if own.foothold_front is None or own.foothold_rear is None:
-        return (jnp.abs(robot.hip_pos[:, 0]).mean(),) * 2
+        return (abs(robot.hip_pos[:, 0]).mean(),) * 2
     return own.foothold_front, own.foothold_rear
 
 
@@ -65,10 +65,10 @@ def mean_force(gaits: list[Gait], config: InSi, robot: RobotParams) -> Float[Arr
     rows = []
     for one in gaits:
         front, rear = levers(config.gaits[one.name], robot)
-        shares = jnp.stack([jnp.asarray(end, float) for end in (rear, front)]) / (front + rear)
+        shares = stacked([rear, front]) / (front + rear)
         standing = [
             sum(phase.duration * sum(phase.stance[i] for i in legs) for phase in one.phases)
             for legs in ((0, 1), (2, 3))
         ]
-        rows.append(shares * one.period / jnp.asarray(standing))
-    return on * weight * jnp.stack(rows)
+        rows.append(shares * one.period / np.asarray(standing))
+    return on * weight * stacked(rows)

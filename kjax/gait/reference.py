@@ -12,10 +12,10 @@ An end that stands several times in a cycle shares its impulse among its stances
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from kjax.concrete import array_library, stacked
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 # Reference rows: deviation of height, pitch, v_z and omega.
@@ -71,41 +71,45 @@ def periodic_reference(
         raise ValueError(f"front and rear must stand, and lift off after each phase, got {modes}")
     stands = [[i for i, mode in enumerate(modes) if MODE_ALPHA[mode, pair] > 0] for pair in (0, 1)]
     total = mass * GRAVITY * float(np.sum(durations))
-    impulses = jnp.stack([lever_rear * total, lever_front * total]) / (lever_front + lever_rear)
+    impulses = stacked([lever_rear * total, lever_front * total]) / (lever_front + lever_rear)
 
     # Integrate on a fine grid of equal cells per phase, forces at the cells' middles.
     cells = 20 * (SAMPLES - 1)
     middle = (np.arange(cells) + 0.5) / cells
-    shape = jnp.clip(np.minimum(middle, 1.0 - middle) / edge, 0.0, 1.0)
-    shape /= shape.mean()
-    force = jnp.zeros((len(modes), cells))
-    moment = jnp.zeros_like(force)
+    xp = array_library(impulses, mass, inertia, edge)
+    shape = xp.clip(np.minimum(middle, 1.0 - middle) / edge, 0.0, 1.0)
+    shape = shape / shape.mean()
+    force: list[Any] = [np.zeros(cells)] * len(modes)
+    moment: list[Any] = [np.zeros(cells)] * len(modes)
     for phases, impulse, lever in zip(stands, impulses, (lever_front, -lever_rear), strict=True):
         pushed = shape * impulse / sum(durations[i] for i in phases)
         for i in phases:
-            force = force.at[i].add(pushed)
-            moment = moment.at[i].add(lever * pushed)  # ahead of the body it turns the nose up
+            force[i] = force[i] + pushed
+            moment[i] = moment[i] + lever * pushed  # ahead of the body it turns the nose up
     step = np.repeat(np.asarray(durations) / cells, cells)
-    z, v_z = _periodic(force.reshape(-1) / mass - GRAVITY, step)
-    theta, omega = _periodic(moment.reshape(-1) / inertia, step)
+    z, v_z = _periodic(xp.concatenate(force) / mass - GRAVITY, step)
+    theta, omega = _periodic(xp.concatenate(moment) / inertia, step)
 
     # The mean over the stances is zero: that is where the height reference refers to, and
     # the trunk is level on average while it can be acted on.
     at = np.arange(len(modes))[:, None] * cells + np.arange(SAMPLES) * (cells // (SAMPLES - 1))
     stances = at[[i for i, mode in enumerate(modes) if mode != Mode.FLIGHT]]
     z, theta = (a - a[stances].mean() for a in (z, theta))
-    rows = jnp.stack([z[at], theta[at], v_z[at], omega[at]], axis=-1)
+    rows = xp.stack([z[at], theta[at], v_z[at], omega[at]], axis=-1)
     return PeriodicReference(rows=rows, impulses=impulses)
 
 
-def _periodic(acceleration: Array, step: np.ndarray) -> tuple[Array, Array]:
+def _periodic(
+    acceleration: Array | np.ndarray, step: np.ndarray
+) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """Position and velocity at the cell borders under a piecewise constant acceleration.
 
     The mean velocity over the cycle is zero, so that the position returns to its start.
     """
-    zero = jnp.zeros((1,), acceleration.dtype)
-    gain = jnp.concatenate([zero, jnp.cumsum(acceleration * step)])
+    xp = array_library(acceleration)
+    zero = xp.zeros((1,), acceleration.dtype)
+    gain = xp.concatenate([zero, xp.cumsum(acceleration * step)])
     travel = gain[:-1] * step + 0.5 * acceleration * step**2
     velocity = gain - travel.sum() / step.sum()
-    displacement = jnp.cumsum(velocity[:-1] * step + 0.5 * acceleration * step**2)
-    return jnp.concatenate([zero, displacement]), velocity
+    displacement = xp.cumsum(velocity[:-1] * step + 0.5 * acceleration * step**2)
+    return xp.concatenate([zero, displacement]), velocity

@@ -9,7 +9,7 @@ steps.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -235,11 +235,12 @@ def stack_bodies(
       feet: (n, 2, 2) front and rear contact points (x, z), body frame [m].
     """
     count = len(feet)
-    return srb_planar.SrbParams(
-        mass=jnp.full(count, mass, float),
-        inertia=jnp.full(count, inertia, float),
-        feet=jnp.asarray(feet, float),
+    leaves: Any = (
+        np.full(count, mass, float),
+        np.full(count, inertia, float),
+        np.asarray(feet, float),
     )
+    return srb_planar.SrbParams(*leaves)
 
 
 @full_precision

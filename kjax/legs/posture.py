@@ -18,16 +18,17 @@ def standing(joint_pos: Float[Array | np.ndarray, "4 3"] | None = None) -> Obser
       joint_pos: (4, 3) of its joints; a common crouch where not given [rad].
     """
     if joint_pos is None:
-        joint_pos = jnp.tile(jnp.array([0.0, 0.9, -1.8]), (4, 1))
-    return Observation(
-        base_pos=jnp.zeros(3),
-        base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
-        base_vel=jnp.zeros(3),
-        base_ang_vel=jnp.zeros(3),
-        joint_pos=jnp.asarray(joint_pos),
-        joint_vel=jnp.zeros((4, 3)),
-        contact=jnp.ones(4, bool),
-    )
+        joint_pos = np.tile([0.0, 0.9, -1.8], (4, 1))
+    fields: dict[str, Any] = {
+        "base_pos": np.zeros(3),
+        "base_quat": np.array([1.0, 0.0, 0.0, 0.0]),
+        "base_vel": np.zeros(3),
+        "base_ang_vel": np.zeros(3),
+        "joint_pos": joint_pos,
+        "joint_vel": np.zeros((4, 3)),
+        "contact": np.ones(4, bool),
+    }
+    return Observation(**jax.device_put(fields))  # compiles nothing, unlike jnp.zeros
 
 
 def stand_pose(robot: RobotParams, com_height: float) -> tuple[float, np.ndarray]:
