@@ -228,10 +228,104 @@ for _name in ("benchmark_simulation", "benchmark_qp", "benchmark_edmd", "benchma
     table(_copied(_name))
 
 
+def _as_left(name: str) -> Callable[[], str]:
+    """The table of a study, as its command leaves it."""
+
+    def left() -> str:
+        return (RESULTS / name / "table.md").read_text(encoding="utf-8").strip() + "\n"
+
+    left.__name__ = name
+    return left
+
+
+for _name in ("tune_trot", "tune_bound", "learn_control"):
+    table(_as_left(_name))
+
+
+def two_digits(value: float) -> str:
+    """A number to two digits, small ones with an exponent."""
+    return f"{value:.1e}".replace("e-0", "e-") if value < 0.01 else f"{value:.2g}"
+
+
 @table
-def tune_trot() -> str:
-    """The table of a tuning, as its command leaves it."""
-    return (RESULTS / "tune_trot" / "table.md").read_text(encoding="utf-8").strip() + "\n"
+def koopman_study() -> str:
+    """Largest error of the velocity after 50 ms on the bound's ranges."""
+    found = load("koopman_study")
+    at = found["horizons_s"].index(0.05)
+    errors = found["max_velocity_error_mps"]["bound ranges"]
+    rows = [
+        (name, *(two_digits(errors[stance][name][at]) for stance in ("trot", "front", "rear")))
+        for name in errors["trot"]
+    ]
+    rows.sort(key=lambda row: -errors["trot"][row[0]][at])
+    return markdown(("model", "trot [m/s]", "front [m/s]", "rear [m/s]"), rows)
+
+
+@table
+def model_walks() -> str:
+    """Every model in closed loop, weights tuned alike."""
+    walks = load("model_walks")["walks"]
+
+    def cells(gait: str, model: str) -> tuple[str, ...]:
+        if f"{gait}, {model}" not in walks:
+            return ("-",) * 3
+        found = walks[f"{gait}, {model}"]["tuned"]
+        if found["falls"] == found["episodes"]:
+            return ("-", "-", f"{found['falls']}")
+        rmse = "{rmse_median:.4f} ({rmse_low:.4f} to {rmse_high:.4f})".format(**found)
+        return rmse, f"{found['pitch_median']:.2g}", f"{found['falls']}"
+
+    models = [one["model"] for one in walks.values() if one["gait"] == "trot"]
+    return markdown(
+        ("model in the LMPC", "trot: RMSE of v_x [m/s]", "pitch, 95 % [deg]", "fell, of 16",
+         "bound: RMSE", "pitch", "fell"),
+        [(model, *cells("trot", model), *cells("bound", model)) for model in models],
+    )  # fmt: skip
+
+
+@table
+def whole_body() -> str:
+    """Models as an LMPC uses them, against the whole robot inside a trot's stance."""
+    models = load("whole_body")["families"]["trot"]
+
+    def cells(model: str) -> tuple[str, ...]:
+        parts = [models[model]["50ms"][what] for what in ("velocity", "omega")]
+        return tuple(cell for one in parts for cell in (f"{one['rms']:.2g}", f"{one['ratio']:.2f}"))
+
+    return markdown(
+        ("inside a trot stance of the whole robot, 50 ms ahead", "velocity [m/s]", "ratio",
+         "pitch rate [rad/s]", "ratio"),
+        [(model, *cells(model)) for model in models],
+    )  # fmt: skip
+
+
+@table
+def own_gaits() -> str:
+    """Gaits that are data alone, on the free base."""
+    rows = []
+    for name, text in (
+        ("pace", "pace, 0.2 s"),
+        ("pronk", "pronk, 0.25 s, duty factor 0.6"),
+        ("walk", "four-beat walk, 0.8 s, duty factor 0.75"),
+    ):
+        found = load(name, "seeds.json")
+        cells = [
+            "{median:.{n}f}, {worst:.{n}f}".format(
+                n=digits, **{k: scale * found[metric][k] for k in ("median", "worst")}
+            )
+            for metric, digits, scale in (
+                ("velocity_reference_rmse_mps", 3, 1.0),
+                ("pitch_max_deg", 1, 1.0),
+                ("roll_max_deg", 1, 1.0),
+                ("foot_slip_m", 1, 1e3),
+            )
+        ]
+        rows.append((text, *cells, f"{found['falls']} of {found['runs']}"))
+    return markdown(
+        ("gait (median, worst)", "RMSE, slewed reference [m/s]", "pitch, largest [deg]",
+         "roll, largest [deg]", "foot slip per stance [mm]", "fell"),
+        rows,
+    )  # fmt: skip
 
 
 @table

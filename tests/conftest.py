@@ -72,6 +72,18 @@ def _fresh_trace_counter():
     chex.clear_trace_counter()
 
 
+# Where every axis has a meaning, one that is left out must be said with None.
+STRICT = ("qp", "koopman", "dynamics", "mpc", "gait", "prediction")
+
+
+@pytest.fixture(autouse=True)
+def _strict_rank_promotion(request):
+    """In the maths an array meets another of its own rank, or the test fails."""
+    strict = request.path.parent.name in STRICT
+    with jax.numpy_rank_promotion("raise" if strict else "allow"):
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _drop_compiled_programs():
     """Let go of what a file compiled: a process may hold 65,530 mappings (Linux's default).

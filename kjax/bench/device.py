@@ -31,6 +31,7 @@ from kjax.sim.engines.mjx import MjxEngine
 from kjax.sim.engines.mujoco import MujocoEngine
 from kjax.sim.episode import initial_state
 from kjax.sim.resolve import resolve_episode, resolve_episodes
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 SIZES = {"cpu": (1024, 16384), "gpu": (1024, 16384, 131072)}  # robots, QPs
@@ -219,6 +220,7 @@ def _found(entry: dict[str, Any], part: str) -> dict[str, Any]:
     return {} if "failed" in entry.get(part, {}) else entry.get(part, {})
 
 
+@figure_style
 def figure(result: dict[str, Any], path: Path) -> None:
     """Rates against the size of the batch, a line per device."""
     fig, axes = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
@@ -235,5 +237,5 @@ def figure(result: dict[str, Any], path: Path) -> None:
             ax.loglog([int(size) for size in points], rates, "o-", label=name)
         ax.set(xlabel="batch", title=title)
     axes[0].legend()
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)

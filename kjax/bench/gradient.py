@@ -17,6 +17,7 @@ from kjax.config.shipped import shipped_config
 from kjax.tuning import loop
 from kjax.tuning.optimise import build_objective
 from kjax.tuning.space import Space, build_space
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 _FILES = {
@@ -217,6 +218,7 @@ def table(result: dict[str, Any]) -> str:
     ))  # fmt: skip
 
 
+@figure_style
 def figure(errors: dict[str, np.ndarray], path: Path) -> None:
     """Distribution of the relative errors."""
     fig, ax = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
@@ -226,7 +228,7 @@ def figure(errors: dict[str, np.ndarray], path: Path) -> None:
     ax.axvline(1e-5, color="k", ls=":", lw=0.8)
     ax.set(xscale="log", xlabel="relative error of the gradient against differences",
            ylabel="part of parameters and scenarios")  # fmt: skip
-    ax.legend(fontsize=7)
+    ax.legend()
     ax.grid(alpha=0.3)
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)

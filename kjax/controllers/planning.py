@@ -254,7 +254,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
 
 def _on_legs(force: Float[Array, "2 2"], stance: Bool[Array, "4"]) -> Float[Array, "4 3"]:
     """Forces (x, y, z) of all legs from the (x, z) of one front and one rear leg that stands."""
-    x, z = jnp.repeat(force, 2, axis=0).T * stance
+    x, z = jnp.repeat(force, 2, axis=0).T * stance[None]
     return jnp.stack([x, jnp.zeros_like(x), z], axis=-1)
 
 

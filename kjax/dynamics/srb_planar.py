@@ -82,7 +82,7 @@ def planted_dynamics(
     force = alpha[:, None] * u.reshape(ground.shape)
     if not world_forces:
         force = force @ planar_rotation(x[2]).T
-    arm = ground - x[:2]
+    arm = ground - x[None, :2]
     moment = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
     accel = force.sum(axis=0) / params.mass - jnp.array([0.0, GRAVITY], x.dtype)
     return jnp.concatenate([x[3:], accel, moment.sum()[None] / params.inertia])
@@ -112,7 +112,7 @@ def rk4_step(
 
 def contact_points(x: Float[Array, "6"], feet: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
     """World positions (2, 2) of contact points given from the centre of mass in the body frame."""
-    return x[:2] + feet @ planar_rotation(x[2]).T
+    return x[None, :2] + feet @ planar_rotation(x[2]).T
 
 
 def rollout(

@@ -133,11 +133,12 @@ def sample(
     # One draw for everything: each call of the generator costs seconds of compilation.
     pieces = -(-steps // hold)
     draw = jax.random.uniform(key, (rollouts, 6 + 4 + 4 * pieces), minval=-1.0, maxval=1.0)
-    x0 = ranges.state_centre + ranges.state_half * draw[:, :6]
-    feet = params.feet + ranges.feet_half * draw[:, 6:10].reshape(rollouts, 2, 2)
+    x0 = ranges.state_centre[None] + ranges.state_half[None] * draw[:, :6]
+    moved = ranges.feet_half[None, None] * draw[:, 6:10].reshape(rollouts, 2, 2)
+    feet = params.feet[None] + moved
     middle = 0.5 * (ranges.input_low + ranges.input_high)
     half = 0.5 * (ranges.input_high - ranges.input_low)
-    inputs = middle + half * draw[:, 10:].reshape(rollouts, pieces, 4)
+    inputs = middle[None, None] + half[None, None] * draw[:, 10:].reshape(rollouts, pieces, 4)
     inputs = jnp.repeat(inputs, hold, axis=1)[:, :steps]
 
     def one(x0: Array, inputs: Array, feet: Array) -> Array:

@@ -105,10 +105,10 @@ def solve(
     """
     R, Y = factor.R[:columns, :columns], factor.R[:columns, columns:]
     if use is not None:
-        R = jnp.where(use, R, 0.0)
+        R = jnp.where(use[None], R, 0.0)
     norm = jnp.linalg.norm(R, axis=0)
     scale = jnp.where(norm > 0, norm, 1.0)
-    left, sigma, right = jnp.linalg.svd(R / scale)
+    left, sigma, right = jnp.linalg.svd(R / scale[None])
     keep = sigma > sigma[0] * ROUNDING * columns * jnp.finfo(R.dtype).eps
     safe = jnp.where(keep, sigma, 1.0)
     gain = jnp.where(keep, safe / (safe**2 + ridge), 0.0)

@@ -136,7 +136,7 @@ def _no_track(observation: Observation) -> None:
 
 def _planar_view(robot: RobotParams, track: None, observation: Observation) -> View:
     body = planar_state(robot, observation)
-    lever = body.feet - body.base
+    lever = body.feet - body.base[None]
     turning = body.omega * jnp.stack([-lever[:, 1], lever[:, 0]], axis=-1)
     inside = jnp.einsum("lij,lj->li", foot_jacobian(robot, body.trig), observation.joint_vel[:, 1:])
     feet_vel = body.base_vel + turning + inside @ body.rotation.T

@@ -154,7 +154,7 @@ def planar_state(robot: RobotParams, observation: Observation) -> PlanarState:
         base_vel=base_vel,
         omega=omega,
         trig=trig,
-        feet=base + local @ rotation.T,
+        feet=base[None] + local @ rotation.T,
     )
     return jax.lax.optimization_barrier(state)
 

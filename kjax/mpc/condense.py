@@ -106,5 +106,5 @@ def discounted_weights(
         spreads.append(jnp.diagonal(total))
     variance = jnp.stack(spreads)
     mean = variance.mean(axis=0)
-    ratio = jnp.where(mean > 0, variance / jnp.where(mean > 0, mean, 1.0), 0.0)
-    return state_weights / (1.0 + uncertainty_discount * ratio)
+    ratio = jnp.where(mean > 0, variance / jnp.where(mean > 0, mean, 1.0)[None], 0.0)
+    return state_weights[None] / (1.0 + uncertainty_discount * ratio)

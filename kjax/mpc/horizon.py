@@ -116,7 +116,7 @@ def build_nodes(
     )
     last = jnp.cumsum(number)
     node = jnp.arange(count)
-    slot = jnp.minimum(jnp.sum(node[:, None] >= last, axis=1), len(last) - 1)
+    slot = jnp.minimum(jnp.sum(node[:, None] >= last[None], axis=1), len(last) - 1)
     used = node < last[-1]
     rank = node - (last - number)[slot]
     length = jnp.where(used, (ahead.duration / jnp.maximum(number, 1))[slot], 0.0)

@@ -51,7 +51,7 @@ def force_limits(
     for end in range(2):
         place = np.eye(4)[2 * end : 2 * end + 2]  # (x, z) of this end among the four forces
         if friction is not None:
-            slide = jnp.array([[1.0, 0.0], [-1.0, 0.0]]) - friction * jnp.array([0.0, 1.0])
+            slide = jnp.array([[1.0, 0.0], [-1.0, 0.0]]) - friction * jnp.array([[0.0, 1.0]])
             rows.append(slide @ rotation @ place)
             low.append(jnp.full((2,), -jnp.inf))
             high.append(jnp.zeros((2,)))

@@ -67,7 +67,7 @@ def solve(
     """
     K = nodes.length.shape[0]
     free, forced = response(params, nodes, forecast, x)
-    weight = params.state_weights * nodes.length[:, None]
+    weight = params.state_weights[None] * nodes.length[:, None]
     B = forced.reshape(6 * K, 2 * K)
     weighted = B * weight.reshape(-1)[:, None]
     R = jnp.repeat(params.input_weight * nodes.length, 2)
@@ -113,12 +113,14 @@ def response(
     zero, one = jnp.zeros_like(t), jnp.ones_like(t)
     drop = jnp.stack([zero, -0.5 * GRAVITY * t**2, zero], axis=-1)
     sink = jnp.stack([zero, -GRAVITY * t, zero], axis=-1)
-    free = jnp.concatenate([x[:3] + x[3:] * t[:, None] + drop, x[3:] + sink], axis=-1)
+    free = jnp.concatenate(
+        [x[None, :3] + x[None, 3:] * t[:, None] + drop, x[None, 3:] + sink], axis=-1
+    )
 
     K = t.shape[0]
     past = jnp.tril(jnp.ones((K, K), t.dtype))
-    gain = past * (nodes.length * nodes.feet)  # (k, j)
-    lag = gain * (t[:, None] - nodes.middle)
+    gain = past * (nodes.length * nodes.feet)[None]  # (k, j)
+    lag = gain * (t[:, None] - nodes.middle[None])
     arm = forecast.foot - forecast.path[:, :2]
     # Acceleration (x, z, theta) by (F_x, F_z) of node j; a force ahead of the body lifts the nose.
     by_force = jnp.stack(
@@ -149,7 +151,8 @@ def force_rows(
     theta = forecast.path[:, 2]
     c, s = jnp.cos(theta), jnp.sin(theta)
     to_body = jnp.stack([jnp.stack([c, s], -1), jnp.stack([-s, c], -1)], axis=-2)
-    foot_centre = forecast.foot + jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+    up = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
+    foot_centre = forecast.foot + up[None]
     local = jnp.einsum("kij,kj->ki", to_body, foot_centre - forecast.path[:, :2]) + lever
     hip = robot.hip_pos[::2, ::2][nodes.end_index]
     trig: LegTrig = jax.lax.optimization_barrier(inverse(robot, local - hip)[2])

@@ -174,7 +174,7 @@ def exact(dt: float) -> Family:
         accel = total / m - jnp.array([0.0, GRAVITY], x.dtype)
         p, v = x[:2], x[3:5]
         ground = srb_planar.contact_points(start.x, start.feet)
-        arm = ground - p
+        arm = ground - p[None]
         moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum()
         # M(t) = moment - t (v x F) - t^2/2 (a x F); a x F holds no F^2, as F x F = 0.
         v_cross_F = v[0] * total[1] - v[1] * total[0]
@@ -257,7 +257,7 @@ def affine_features(start: Start, x: Array, u: Array) -> Float[Array, "17"]:
     The contact points are taken from the centre of mass, so that nothing depends on how far the
     robot has walked or how high the ground is.
     """
-    arm = srb_planar.contact_points(start.x, start.feet) - x[:2]
+    arm = srb_planar.contact_points(start.x, start.feet) - x[None, :2]
     one = jnp.ones((1,), x.dtype)
     products = arm * u.reshape(2, 2)[:, ::-1]  # x F_z and z F_x of either end
     return jnp.concatenate([one, x[2:], u, arm.reshape(4), products.reshape(4)])

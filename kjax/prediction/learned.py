@@ -148,8 +148,8 @@ def _units(params: LearnedModel, data: Snapshots) -> tuple[tuple[Layer, ...], Bi
     change = jnp.diff(lifted, axis=1).std(axis=(0, 1))
     size = jnp.sqrt((lifted**2).mean(axis=(0, 1)))
     force = data.inputs.std(axis=(0, 1))
-    A = change[:, None] / (size + 1e-9)
-    B = A[:, :, None].swapaxes(0, 1) / (force + 1e-9)
+    A = change[:, None] / (size + 1e-9)[None]
+    B = A[:, :, None].swapaxes(0, 1) / (force + 1e-9)[None, None]
     layers = jax.tree.map(jnp.ones_like, params.layers)
     return layers, BilinearModel(A, B, jnp.zeros_like(params.head.B_feet))
 
@@ -165,7 +165,7 @@ def prediction_loss(
             return z, z[STATE_ROWS]
 
         _, predicted = jax.lax.scan(step, lift(params, states[0]), inputs)
-        return jnp.mean(((predicted - states[1:]) / unit) ** 2)
+        return jnp.mean(((predicted - states[1:]) / unit[None]) ** 2)
 
     return jax.vmap(one)(*data).mean()
 

@@ -166,7 +166,7 @@ def _solve_whole(
     H, d = hessian if index is None else jax.tree.map(lambda a: a[index], hessian)
     row_lower, row_upper, lower, upper = bounds
     found = solve_rows(
-        H / (d[:, None] * d), q, C, row_lower, row_upper, lower, upper, value[0],
+        H / (d[:, None] * d[None]), q, C, row_lower, row_upper, lower, upper, value[0],
         method=settings.row_method,
         tolerance=settings.tolerance,
         max_iterations=settings.max_iterations,
@@ -190,7 +190,7 @@ def _derivative(settings: _Settings, primals: Any, tangents: Any) -> tuple[Any, 
     )
     solution, y = _with_rows(settings, box, qp)
     d = qp.prepared.scale if qp.which is None else qp.prepared.scale[qp.which]
-    units = d[:, None] * d
+    units = d[:, None] * d[None]
     data, change = (one._replace(H=one.H / units) for one in (qp.stacked(), change.stacked()))
     good = solution.violated & (solution.status <= Status.ITERATION_LIMIT)
     x = solution.x

@@ -180,11 +180,11 @@ def prepare(H: Float[Array, "n n"], fixed: Bool[Array, "n"] | None = None) -> Pr
         scale=scale,
         table=swept(stand_in, bound_status == 0),
         bound_status=bound_status,
-        inverse=(vectors / eigenvalues) @ vectors.T,
+        inverse=(vectors / eigenvalues[None]) @ vectors.T,
         eig_min=eigenvalues[0],
         eig_max=eigenvalues[-1],
         rho=rho,
-        resolvent=(vectors / (eigenvalues + rho)) @ vectors.T,
+        resolvent=(vectors / (eigenvalues + rho)[None]) @ vectors.T,
         finite=finite,
         definite=definite | ~finite,
     )

@@ -45,7 +45,7 @@ class RowProblem(NamedTuple):
     def gram(self, w: Array) -> Array:
         """Transposed rows times weights (m + n,) times rows."""
         m = self.C.shape[0]
-        return (self.C.T * w[:m]) @ self.C + jnp.diag(w[m:])
+        return (self.C.T * w[None, :m]) @ self.C + jnp.diag(w[m:])
 
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds (m + n,), infinite where there is none."""
@@ -101,9 +101,9 @@ def variable_units(
     if C.shape[0] == 0:
         return d
     # Ruiz equilibration of the columns that H says nothing about.
-    size = jnp.abs(C) * free
+    size = jnp.abs(C) * free[None]
     for _ in range(3):
-        row = jnp.max(size * d, axis=1, keepdims=True)
+        row = jnp.max(size * d[None], axis=1, keepdims=True)
         column = jnp.max(size / jnp.where(row > 0, row, 1.0), axis=0)
         d = jnp.where(curved | ~(column > 0), d, 1.0 / jnp.where(column > 0, column, 1.0))
     return d
@@ -122,7 +122,7 @@ def scale_rows(data: RowData, *, equilibrate: bool = True) -> tuple[RowProblem, 
     d = variable_units(H, C[: len(C) * equilibrate], free)
     # Fixed variables leave: their columns act through q and the rows' bounds.
     linear = jnp.where(free, q + H @ at, 0.0) * d
-    C_free = C * d * free
+    C_free = C * d[None] * free[None]
     # Measured by the largest entry: the squares of very small or large ones are 0 or infinite.
     largest = jnp.max(jnp.abs(C_free), axis=1)
     immovable = largest == 0
@@ -144,7 +144,7 @@ def scale_rows(data: RowData, *, equilibrate: bool = True) -> tuple[RowProblem, 
     low_hat, high_hat = low_hat / sigma, high_hat / sigma
     equal = (low == high) & ~off
     problem = RowProblem(
-        H=H * (d[:, None] * d) * (free[:, None] & free) * (sigma / cost)
+        H=H * (d[:, None] * d[None]) * (free[:, None] & free[None]) * (sigma / cost)
         + jnp.diag(jnp.where(fixed, own, 0.0)),
         q=linear / cost,
         C=C_free / length[:, None],
@@ -169,7 +169,7 @@ def _expected_size(slope: Array, h: Array, low: Array, high: Array, off: Array, 
     tiny = jnp.finfo(low.dtype).tiny
     free_size = jnp.where(h > 0, slope / jnp.where(h > 0, h, 1.0), jnp.where(slope > 0, jnp.inf, 0))
     sides = jnp.stack([low, high])
-    present = jnp.isfinite(sides) & ~off
+    present = jnp.isfinite(sides) & ~off[None]
     largest = jnp.max(jnp.where(present, jnp.abs(sides), 0.0), initial=0.0)
     # Bounds that keep x from 0.
     least = jnp.max(jnp.where(off, 0.0, jnp.maximum(jnp.maximum(low, -high), 0.0)), initial=0.0)
@@ -204,7 +204,7 @@ def kkt_errors(
     y = jnp.where(jnp.where(y > 0, high < jnp.inf, low > -jnp.inf), y, 0.0)
     y_rows, y_box, size_x = y[:m], y[m:], jnp.abs(x)
     # Sums of products, not products of matrices: the sum and that of its terms in one pass.
-    by_H, by_C, by_y = H * x, C * x, C * y_rows[:, None]
+    by_H, by_C, by_y = H * x[None], C * x[None], C * y_rows[:, None]
     Hx, value, push = by_H.sum(1), by_C.sum(1), by_y.sum(0)
     inverse = jnp.where(d > 0, 1.0 / jnp.where(d > 0, d, 1.0), 0.0)
     reach = jnp.max(size_x * inverse)

@@ -321,7 +321,7 @@ def table(found: Sequence[dict[str, Any]], *, quick: bool) -> str:
 
 def figure(found: Sequence[dict[str, Any]], path: Path) -> None:
     """Largest relative difference of each part on a logarithmic axis, with the limits."""
-    from kjax.viz.plots import BLUE, DARK, GREY, RED, STYLE
+    from kjax.viz.style import BLUE, DARK, GREY, RED, STYLE
 
     colours = dict(zip(GAITS, (BLUE, DARK, RED), strict=True))
     checks = [check for check in LIMITS if any(one["check"] == check for one in found)]

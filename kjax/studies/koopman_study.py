@@ -29,6 +29,7 @@ from kjax.options import File, Options, fail, parse
 from kjax.prediction import evaluation, families, learned
 from kjax.robots import get_robot
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 DT = 1e-3  # s
@@ -302,6 +303,7 @@ COLOURS = (
 FLOOR = 1e-9  # m/s, end of the axis
 
 
+@figure_style
 def figure(result: dict[str, Any], path: Path) -> None:
     """Error of the velocity against the horizon, bound ranges.
 
@@ -336,5 +338,5 @@ def figure(result: dict[str, Any], path: Path) -> None:
     axes[0][0].set_ylabel("rms error of the velocity [m/s]")
     handles, labels = axes[0][0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside right center", fontsize=8)
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)

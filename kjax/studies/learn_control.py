@@ -36,6 +36,7 @@ from kjax.sim.resolve import batch_spec, resolve_episode
 from kjax.sim.summary import summarise
 from kjax.tuning import loop
 from kjax.types import MODE_ALPHA, Mode
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 DT, STEPS, ROLLOUTS = 1e-3, 100, 100
@@ -237,6 +238,7 @@ def table(result: dict[str, Any]) -> str:
     )
 
 
+@figure_style
 def figure(result: dict[str, Any], path: Path) -> None:
     """Losses; cost of every held-out scenario, with control against without."""
     fig, (curve, pairs) = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
@@ -253,7 +255,5 @@ def figure(result: dict[str, Any], path: Path) -> None:
     pairs.plot(first, second, "o", ms=3)
     pairs.set(xlabel=f"cost, trained for {names[0]}", ylabel=f"cost, for {names[1]}",
               title="held-out scenarios", aspect="equal")  # fmt: skip
-    for ax in (curve, pairs):
-        ax.grid(alpha=0.3)
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)

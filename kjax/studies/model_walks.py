@@ -25,6 +25,7 @@ from kjax.options import File, Options, fail, parse, require_names
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.intervals import bootstrap
 from kjax.studies.prediction_models import MODELS, residual
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 GAITS = {"trot": "trot_velocity_long.toml", "bound": "bound_velocity_short.toml"}
@@ -243,6 +244,7 @@ def _interval(entry: dict[str, Any], name: str) -> str:
     return "none stayed up" if np.isnan(value) else f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
+@figure_style
 def figure(found: dict[str, Any], path: Path) -> None:
     """Error of the speed and pitch of each model, tuned and with the config's own weights."""
     gaits = list(dict.fromkeys(entry["gait"] for entry in found.values()))
@@ -279,7 +281,7 @@ def figure(found: dict[str, Any], path: Path) -> None:
         row[0].invert_yaxis()
     handles, labels = axes[0][0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8)
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)
 
 

@@ -328,7 +328,7 @@ def _sizes() -> dict[str, Callable[[float], bool]]:
 
 def figure(found: Sequence[dict[str, Any]], path: Path) -> None:
     """Largest and median pitch over the size of the step, with falls and limits."""
-    from kjax.viz.plots import BLUE, DARK, GREY, RED, STYLE
+    from kjax.viz.style import BLUE, DARK, GREY, RED, STYLE
 
     if not found:
         return

@@ -3,11 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-import numpy as np
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
 
 from kjax.config import RunConfig
@@ -18,19 +15,9 @@ from kjax.sim.resolve import resolve_goal
 from kjax.sim.series import Series
 from kjax.sim.trajectory import Trajectory
 from kjax.types import JOINT_NAMES, Leg
+from kjax.viz.style import BLUE, DARK, GREEN, GREY, ORANGE, RED, STYLE
 
-BLUE, RED, GREY, DARK = "#2b6cb0", "#c53030", "#a0aec0", "#2d3748"
-_LEG_COLOURS = ("#c53030", "#2b6cb0", "#dd6b20", "#2f855a")
-STYLE = {
-    "font.size": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "legend.frameon": False,
-    "legend.fontsize": 7,
-    "lines.linewidth": 0.9,
-}
+_LEG_COLOURS = (RED, BLUE, ORANGE, GREEN)
 
 
 def closed_loop_figure(run: Trajectory, config: RunConfig, path: Path, title: str = "") -> None:

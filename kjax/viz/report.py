@@ -15,16 +15,8 @@ from kjax.moved import moved_names
 from kjax.sim.resolve import resolve_field
 from kjax.sim.series import Series
 from kjax.sim.terrain import generate, shapes
-from kjax.viz.plots import (
-    BLUE,
-    DARK,
-    GREY,
-    RED,
-    STYLE,
-    gait_bars,
-    moving_mean,
-    zoom_window,
-)
+from kjax.viz.plots import gait_bars, moving_mean, zoom_window
+from kjax.viz.style import BLUE, DARK, GREY, RED, STYLE
 
 __getattr__ = moved_names(__name__)
 

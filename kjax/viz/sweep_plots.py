@@ -10,10 +10,12 @@ import xarray as xr
 from scipy import stats
 
 from kjax.config import SweepConfig
+from kjax.viz.style import figure_style
 
 _LEVEL = 0.95  # of all intervals
 
 
+@figure_style
 def sweep_figure(dataset: xr.Dataset, sweep: SweepConfig, path: Path) -> None:
     """Draw what the sweep's ``figure`` asks for: success, or medians of metrics, over its axes.
 
@@ -57,7 +59,7 @@ def sweep_figure(dataset: xr.Dataset, sweep: SweepConfig, path: Path) -> None:
                 ax.set_title(f"{_label(sweep, wish.panels)}: {panel}")
     if wish.title:
         fig.suptitle(wish.title)
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)
 
 

@@ -58,7 +58,7 @@ def test_samples_fill_their_ranges_and_stay_inside(snapshots, snapshots_moving_f
     spread = (np.asarray(start).reshape(-1, 6) - middle) / half
     forces = np.asarray(inputs).reshape(-1, 4)
     low, high = np.array([-60.0, 0.0, -60.0, 0.0]), np.array([60.0, 150.0, 60.0, 150.0])
-    shift = np.asarray((snapshots_moving_feet.feet - body.feet) / jnp.array([0.12, 0.05]))
+    shift = (np.asarray(snapshots_moving_feet.feet) - np.asarray(body.feet)) / [0.12, 0.05]
     for unit in (spread, (forces - (low + high) / 2) / ((high - low) / 2), shift.reshape(-1, 4)):
         assert np.abs(unit).max() <= 1.0
         # 200 uniform draws all miss the outermost 5 % with probability 0.95^200 = 3.5e-5.
@@ -80,11 +80,11 @@ def test_the_key_decides_the_data(sampler, ranges):
 
 
 def test_states_forces_and_contact_points_are_drawn_independently(sampler, ranges):
-    data = sampler(jax.random.key(0), ranges)
+    data, ranges = jax.device_get((sampler(jax.random.key(0), ranges), ranges))
     unit = [
-        (np.asarray(data.states[:, 0]) - ranges.state_centre) / ranges.state_half,
-        (np.asarray(data.inputs[:, 0, 0::2]) - ranges.input_low[0]) / 120.0 * 2 - 1,
-        (np.asarray(data.feet) - np.array([[0.19, -0.25], [-0.18, -0.26]])) / ranges.feet_half,
+        (data.states[:, 0] - ranges.state_centre) / ranges.state_half,
+        (data.inputs[:, 0, 0::2] - ranges.input_low[0]) / 120.0 * 2 - 1,
+        (data.feet - np.array([[0.19, -0.25], [-0.18, -0.26]])) / ranges.feet_half,
     ]
     flat = np.concatenate([np.asarray(a).ravel() for a in unit])
     # No draw is used twice: a shared key would repeat values to rounding.

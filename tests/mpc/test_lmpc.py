@@ -437,7 +437,7 @@ def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bound
     fraction = 0.8 * float((torque / np.tile(go1.PARAMS.torque_limit[1:], 2)).max())
     _, rows = planned(None, fraction)
     limited, _ = planned(None, fraction)
-    assert (np.abs(limited @ rows.A.T) <= rows.high + 1e-6).all()
+    assert (np.abs(np.asarray(limited @ rows.A.T)) <= np.asarray(rows.high) + 1e-6).all()
 
 
 def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():

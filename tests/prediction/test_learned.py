@@ -69,7 +69,7 @@ def test_the_loss_is_the_many_step_error_of_the_family(trained):
     for states, inputs, feet in zip(*data, strict=True):
         start = families.Start(states[0], feet)
         predicted = families.rollout(family, model, start, inputs)
-        errors.append((predicted[1:] - states[1:]) / unit)
+        errors.append(np.asarray(predicted[1:] - states[1:]) / unit)
     wanted = np.mean(np.square(errors))
     got = jax.jit(learned.prediction_loss)(model, data, jnp.asarray(unit))
     np.testing.assert_allclose(got, wanted, rtol=1e-12)

@@ -165,7 +165,7 @@ def test_the_units_of_the_variables_change_no_bit(random_qp, method):
     unit = jnp.asarray(2.0 ** np.arange(-18, 18, 3))
     plain = solve(H, q, lower, upper, method=method, tolerance=1e-10)
     other = solve(
-        H * unit[:, None] * unit,
+        H * unit[:, None] * unit[None],
         q * unit,
         lower / unit,
         upper / unit,

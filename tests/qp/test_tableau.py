@@ -56,7 +56,7 @@ def test_carried_through_two_thousand_ticks_it_stays_exact():
     solutions = solve_chain(qp.prepare(H), q, lower, upper)
     assert (solutions.status == Status.SOLVED).all()
     np.testing.assert_allclose(solutions.x, by_daqp(H, q, lower, upper), atol=1e-8)
-    active = ((solutions.x == lower) | (solutions.x == upper)).sum(axis=1)
+    active = ((solutions.x == lower[None]) | (solutions.x == upper[None])).sum(axis=1)
     assert 1.0 < active.mean() < N - 1  # else there was nothing to find
     assert solutions.iterations.mean() < 1.0  # two sides change in a few ticks, none in most
 
@@ -213,7 +213,7 @@ def test_forward_and_reverse_mode_agree_through_scan_and_vmap():
     reverse = jax.vmap(jax.grad(total), (0, None))(batch, 1.3)
     direction = jnp.sin(jnp.arange(q.size)).reshape(q.shape)
     forward = jax.vmap(lambda q: jax.jvp(lambda q: total(q, 1.3), (q,), (direction,))[1])(batch)
-    np.testing.assert_allclose((reverse * direction).sum(axis=(1, 2)), forward, rtol=1e-9)
+    np.testing.assert_allclose((reverse * direction[None]).sum(axis=(1, 2)), forward, rtol=1e-9)
     # The warm start carries no derivative: the ticks are independent problems.
     alone = jax.vmap(
         jax.grad(lambda q: (qp.solve(qp.prepare(1.3 * H), q, lower, upper).x ** 2).sum())

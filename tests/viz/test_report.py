@@ -12,7 +12,8 @@ from kjax.sim.resolve import resolve_field
 from kjax.sim.series import Series
 from kjax.sim.terrain import generate
 from kjax.viz import report
-from kjax.viz.plots import BLUE, RED, moving_mean
+from kjax.viz.plots import moving_mean
+from kjax.viz.style import BLUE, RED
 
 DT = 0.005  # s
 CYCLE = 0.5  # s

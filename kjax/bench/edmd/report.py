@@ -8,6 +8,7 @@ import numpy as np
 
 from kjax.bench.edmd.data import DICTIONARIES, LOOP, PAPER, SEEDS, VELOCITIES
 from kjax.types import STATE_NAMES
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 
@@ -67,6 +68,7 @@ def _stream(flow: dict[str, Any]) -> str:
     return markdown_table((f"stream of {flow['snapshots']:,} snapshots", ""), rows)
 
 
+@figure_style
 def figure(result: dict[str, Any], path: Path) -> None:
     """Times of the fits and rates of the rollouts."""
     fig, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
@@ -83,9 +85,9 @@ def figure(result: dict[str, Any], path: Path) -> None:
             ax.bar(place + 0.4 * i - 0.2, [found[key][n] for n in names], 0.4, label=label)
         ax.set_xticks(place, names)
         ax.set(title=title, ylabel=f"time [{unit}]")
-        ax.legend(fontsize=8)
+        ax.legend()
     rivals = ("kjax", "NumPy,\nvectorised", "NumPy,\nloop")
     axes[2].bar(rivals, [data[n] for n in ("kjax", "numpy_vectorised", "numpy_loop")])
     axes[2].set(title="data: rollouts of 100 steps", ylabel="rollouts per second", yscale="log")
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)

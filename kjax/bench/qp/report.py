@@ -5,6 +5,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 
@@ -58,6 +59,7 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+@figure_style
 def figure(result: dict[str, Any], path: Path) -> None:
     """Cost against the number of variables, and against the batch."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
@@ -79,7 +81,7 @@ def figure(result: dict[str, Any], path: Path) -> None:
     left.set(xlabel="variables", ylabel="single call from Python [us]", title="QPs of the trot")
     left.set_xticks(sizes, [str(n) for n in sizes])
     left.minorticks_off()
-    left.legend(fontsize=7)
+    left.legend()
     for color, (gait, batches) in zip(("C0", "C1"), result["batch"].items(), strict=True):
         counts = [int(k) for k in batches]
         for solver, style in (("kjax", "o-"), ("daqp loop", "--")):
@@ -88,6 +90,6 @@ def figure(result: dict[str, Any], path: Path) -> None:
                 label = f"{gait.split('_')[0]}, {solver}"
                 right.loglog(counts, values, style, color=color, label=label)
     right.set(xlabel="batch", ylabel="us per problem", title="24 variables, cold, one thread")
-    right.legend(fontsize=8)
-    fig.savefig(path, dpi=120)
+    right.legend()
+    fig.savefig(path)
     plt.close(fig)

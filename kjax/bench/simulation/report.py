@@ -5,6 +5,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 
@@ -24,6 +25,7 @@ def table(result: dict[str, Any]) -> str:
     return markdown_table(header, rows)
 
 
+@figure_style
 def figure(result: dict[str, Any], path: Path) -> None:
     """Robot-steps per second against the number of robots."""
     fig, ax = plt.subplots(figsize=(6, 4), layout="constrained")
@@ -46,5 +48,5 @@ def figure(result: dict[str, Any], path: Path) -> None:
     ax.set(xlabel="robots", ylabel="robot-steps per second",
            title=f"Flat trot, {result['threads']} threads")  # fmt: skip
     ax.legend(fontsize=7, loc="center right")
-    fig.savefig(path, dpi=120)
+    fig.savefig(path)
     plt.close(fig)

@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from kjax.config import RunConfig
+from kjax.viz.style import figure_style
 from kjax.viz.tables import markdown_table
 
 
@@ -29,6 +30,7 @@ def table(record: dict[str, Any]) -> str:
     return markdown_table(header, rows)
 
 
+@figure_style
 def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path: Path) -> None:
     """Loss curve; one held-out scenario before and after."""
     fig, (curve, speed, pitch) = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
@@ -37,7 +39,7 @@ def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path
     curve.plot(descent["checks"], descent["held_out"], "o-", ms=2.5, label="held out")
     curve.axhline(costs["own"], color="k", ls="--", lw=0.8, label="config's own parameters")
     curve.set(xlabel="update of Adam", ylabel="cost [-]", yscale="log")
-    curve.legend(fontsize=7)
+    curve.legend()
     dt = config.lmpc.control_dt
     first = next(iter(runs.values()))
     time_axis = np.arange(len(first.x)) * dt
@@ -48,8 +50,6 @@ def figure(record: dict[str, Any], runs: dict[str, Any], config: RunConfig, path
         pitch.plot(time_axis, np.degrees(shown[:, 2]), lw=0.9, label=name)
     speed.set(xlabel="time [s]", ylabel="v_x [m/s]", title="a held-out scenario, rigid body")
     pitch.set(xlabel="time [s]", ylabel="pitch [deg]")
-    speed.legend(fontsize=7)
-    for ax in (curve, speed, pitch):
-        ax.grid(alpha=0.3)
-    fig.savefig(path, dpi=120)
+    fig.legend(*speed.get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    fig.savefig(path)
     plt.close(fig)

@@ -84,12 +84,12 @@ def save_figure(curves: dict[str, Any], dt: float, path: Path) -> None:
     """
     import matplotlib.pyplot as plt
 
-    from kjax.viz import plots
+    from kjax.viz import style
 
-    colours = {"nominal": plots.DARK, "affine": plots.BLUE, "clock_history": "#2f855a",
-               "touchdown": plots.RED}  # fmt: skip
+    colours = {"nominal": style.DARK, "affine": style.BLUE, "clock_history": style.GREEN,
+               "touchdown": style.RED}  # fmt: skip
     columns = [(gait, where) for gait in curves for where in ("inside", "all_starts")]
-    with plt.rc_context(plots.STYLE | {"lines.linewidth": 1.3}):
+    with plt.rc_context(style.STYLE | {"lines.linewidth": 1.3}):
         fig, axes = plt.subplots(
             2, len(columns), figsize=(2.3 * len(columns), 4.6), sharex=True, squeeze=False
         )
@@ -104,7 +104,7 @@ def save_figure(curves: dict[str, Any], dt: float, path: Path) -> None:
                     axis.plot(time_ms, curve, "o-", ms=2.5, color=colour, label=LABELS[name])
                 if where == "all_starts":
                     frozen = curves[gait][where, "frozen nominal"][key]
-                    axis.plot(time_ms, frozen, "--", color=plots.GREY,
+                    axis.plot(time_ms, frozen, "--", color=style.GREY,
                               label="rigid body, present feet kept")  # fmt: skip
                 # Feet kept through a bound's flight would press all others flat.
                 highest = curves[gait][where, scheme + "nominal"][key][-1]
