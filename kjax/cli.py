@@ -177,6 +177,29 @@ def save_json(path: Path, data: Any) -> None:
     write_text(path, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
 
 
+def save_study(
+    folder: Path,
+    record: dict[str, Any],
+    text: str,
+    draw: Callable[[Path], None],
+    *,
+    file: str = "metrics.json",
+) -> None:
+    """What a study leaves: its numbers with their provenance, a table and a figure; says so.
+
+    Args:
+      folder: of the study.
+      record: its numbers.
+      text: the table, Markdown.
+      draw: writes the figure to a path.
+      file: name of the numbers' file.
+    """
+    save_json(folder / file, {"provenance": provenance(), **record})
+    write_text(folder / "table.md", text)
+    draw(folder / "figure.png")
+    print(f"\n{text}\nresults in {folder}/: {file}, table.md, figure.png")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     scratch = path.with_name(path.name + ".part")

@@ -118,15 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         cells = [config for row in part.configs for config in row]
         if all(batch_key(cache, one, "every_step", part.dtype) in cache for one in cells):
             found.append(judged(part, cache))
-    cli.save_json(
-        folder / "results.json",
-        {"provenance": cli.provenance(), "quick": args.quick, "limits": LIMITS,
-         "parts": found},
-    )  # fmt: skip
+    record = {"quick": args.quick, "limits": LIMITS, "parts": found}
     text = table(found, quick=args.quick)
-    cli.write_text(folder / "table.md", text)
-    figure(found, folder / "figure.png")
-    print(f"\n{text}\nresults in {folder}/: results.json, table.md, figure.png")
+    cli.save_study(folder, record, text, lambda path: figure(found, path), file="results.json")
     return 0
 
 

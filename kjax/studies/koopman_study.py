@@ -83,13 +83,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", True)
     clock = time.perf_counter()
     result = study(args)
-    (folder / "table.md").write_text(table(result), encoding="utf-8")
-    figure(result, folder / "figure.png")
-    record = {"provenance": cli.provenance(), **summary(result), **residual, **compact(result)}
-    cli.save_json(folder / "metrics.json", record)
     cli.save_json(folder / "details.json", result)
-    print(table(result))
-    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+    record = {**summary(result), **residual, **compact(result)}
+    cli.save_study(folder, record, table(result), lambda path: figure(result, path))
+    print(f"{time.perf_counter() - clock:.0f} s in all")
     return 0
 
 

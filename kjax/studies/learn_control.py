@@ -87,11 +87,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     result["cost_ratio_low"], result["cost_ratio_high"] = bootstrap(
         lambda a, b: b.mean(axis=1) / a.mean(axis=1), first, second
     )
-    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), **result})
-    (folder / "table.md").write_text(table(result), encoding="utf-8")
-    figure(result, folder / "figure.png")
-    print(table(result))
-    print(f"{time.perf_counter() - clock:.0f} s in all; results in {folder}/")
+    cli.save_study(folder, result, table(result), lambda path: figure(result, path))
+    print(f"{time.perf_counter() - clock:.0f} s in all")
     return 0
 
 

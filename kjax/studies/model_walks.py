@@ -85,12 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{label}: rmse {tuned['rmse_median']:.4f} m/s, {tuned['falls']} of "
               f"{tuned['episodes']} fell, tuned on {found[label]['sets']} sets "
               f"({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
-    text = table(found)
-    (folder / "table.md").write_text(text, encoding="utf-8")
-    figure(found, folder / "figure.png")
-    cli.save_json(folder / "metrics.json", {"provenance": cli.provenance(), "walks": found})
-    print(text)
-    print(f"results in {folder}/")
+    cli.save_study(folder, {"walks": found}, table(found), lambda path: figure(found, path))
     return 0
 
 

@@ -108,16 +108,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("stopped; the same command goes on from here")
         return 130
     found = list(_finished(cache, args))
-    cli.save_json(
-        folder / "results.json",
-        {"provenance": cli.provenance(), "quick": args.quick, "seeds": args.seeds,
-         "pitch_limit_deg": {f"{size:g}": limit for size, limit in PITCH.items()},
-         "steps": found},
-    )  # fmt: skip
+    record = {
+        "quick": args.quick,
+        "seeds": args.seeds,
+        "pitch_limit_deg": {f"{size:g}": limit for size, limit in PITCH.items()},
+        "steps": found,
+    }
     text = table(found, quick=args.quick)
-    cli.write_text(folder / "table.md", text)
-    figure(found, folder / "figure.png")
-    print(f"\n{text}\nresults in {folder}/: results.json, table.md, figure.png")
+    cli.save_study(folder, record, text, lambda path: figure(found, path), file="results.json")
     return 0
 
 

@@ -153,13 +153,10 @@ def tune(config: RunConfig, args: Task, folder: Path) -> None:
         "values": {name: space.overrides(z) for name, z in sets.items()},
         "mujoco": verdict,
     }
-    cli.save_json(folder / "metrics.json", record)
-    text = report.table(record)
-    (folder / "table.md").write_text(text, encoding="utf-8")
     runs = traces(short, space, sets, held_out)
-    report.figure(record, runs, short, folder / "figure.png")
-    print(text)
-    print(f"results in {folder}/")
+    cli.save_study(
+        folder, record, report.table(record), lambda path: report.figure(record, runs, short, path)
+    )
     if not result.healthy:
         fail(f"the descent broke off: {result.stopped}; tuned.toml is the last good point")
 
@@ -201,7 +198,6 @@ def _descend(
 def _record(args: Task, result: Descent, searches: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """What metrics.json says of how the parameters were found."""
     return {
-        "provenance": cli.provenance(),
         "keys": list(args.keys),
         "worsen": args.worsen,
         "scenarios": {"train": args.scenarios, "held_out": args.held_out, "seconds": args.seconds},

@@ -83,11 +83,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 130
         _save_models(gait, fits, folder)
         families[gait] = compare(gait, held, folder, args.quick)
-    (folder / "table.md").write_text(report.table(families), encoding="utf-8")
-    cli.save_json(folder / "metrics.json", _summary(args, metrics, families))
     cli.save_json(folder / "details.json", metrics)
-    report.save_figure(curves, DT, folder / "figure.png")
-    print(f"\n{report.table(families)}\nresults in {folder}/")
+    cli.save_study(
+        folder,
+        _summary(args, metrics, families),
+        report.table(families),
+        lambda path: report.save_figure(curves, DT, path),
+    )
     return 0
 
 
@@ -147,7 +149,6 @@ def _summary(
         "force_noise_n": args.force,
         **{gait: report.compact(entry) for gait, entry in metrics.items()},
         "families": families,
-        "provenance": cli.provenance(),
     }
 
 
