@@ -280,5 +280,5 @@ def _above_ground(body: PlanarState, ground: Array) -> PlanarState:
     """The body in the frame whose origin is the ground below its centre of mass."""
     origin = jnp.stack([body.x[0], ground])
     return body._replace(
-        x=body.x.at[:2].add(-origin), base=body.base - origin, feet=body.feet - origin
+        x=body.x.at[:2].add(-origin), base=body.base - origin, feet=body.feet - origin[None]
     )

@@ -139,7 +139,7 @@ def _planar_view(robot: RobotParams, track: None, observation: Observation) -> V
     lever = body.feet - body.base[None]
     turning = body.omega * jnp.stack([-lever[:, 1], lever[:, 0]], axis=-1)
     inside = jnp.einsum("lij,lj->li", foot_jacobian(robot, body.trig), observation.joint_vel[:, 1:])
-    feet_vel = body.base_vel + turning + inside @ body.rotation.T
+    feet_vel = body.base_vel[None] + turning + inside @ body.rotation.T
     return View(planar=body, feet=body.feet, feet_vel=feet_vel, base_vel=body.base_vel, whole=None)
 
 
@@ -189,8 +189,8 @@ def _free_view(robot: RobotParams, track: Float[Array, "2"], observation: Observ
     omega = spatial.rotate(body.heading, body.omega)
     jacobian = spatial.foot_jacobian(robot, body.hip, body.planar.trig)
     inside = jnp.einsum("lij,lj->li", jacobian, observation.joint_vel)
-    turning = jnp.cross(omega, body.feet - body.base)
-    feet_vel = body.base_vel + turning + inside @ body.rotation.T
+    turning = jnp.cross(omega[None], body.feet - body.base[None])
+    feet_vel = body.base_vel[None] + turning + inside @ body.rotation.T
     return View(
         planar=body.planar, feet=body.feet, feet_vel=feet_vel, base_vel=body.base_vel, whole=body
     )

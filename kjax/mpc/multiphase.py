@@ -153,7 +153,7 @@ def force_rows(
     to_body = jnp.stack([jnp.stack([c, s], -1), jnp.stack([-s, c], -1)], axis=-2)
     up = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
     foot_centre = forecast.foot + up[None]
-    local = jnp.einsum("kij,kj->ki", to_body, foot_centre - forecast.path[:, :2]) + lever
+    local = jnp.einsum("kij,kj->ki", to_body, foot_centre - forecast.path[:, :2]) + lever[None]
     hip = robot.hip_pos[::2, ::2][nodes.end_index]
     trig: LegTrig = jax.lax.optimization_barrier(inverse(robot, local - hip)[2])
     torque = jnp.einsum("kij,kil->kjl", foot_jacobian(robot, trig), to_body)  # J^T R^T

@@ -63,7 +63,7 @@ def active_equations(
     active &= ~jnp.concatenate([scaling.immovable, jnp.zeros((n,), bool)])
     unit_cost = scaling.multipliers[-1] * scaling.values[-1]
     return ActiveEquations(
-        H=symmetric * scaling.x[:, None] * scaling.x / unit_cost,
+        H=symmetric * scaling.x[:, None] * scaling.x[None] / unit_cost,
         A=jnp.where(active[:, None], A * scaling.x[None] / scaling.values[:, None], 0.0),
         active=active,
         at_low=at_low | ((low == high) & (y < 0)),

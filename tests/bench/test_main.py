@@ -104,21 +104,28 @@ def test_the_controller_s_latency_and_unless_left_out_its_start(
 
 
 def test_a_start_is_timed_with_an_empty_and_then_a_filled_compile_cache(monkeypatch):
-    caches = []
+    commands, caches = [], []
 
     def run(command, *, env, check, capture_output):
-        assert command[1:4] == ["-m", "kjax.studies.closed_loop", "trot.toml"]
-        folder = command[command.index("--out") + 1]
-        cache = env["JAX_COMPILATION_CACHE_DIR"]
-        caches.append((cache, sorted(controller.Path(folder).parent.glob("cache/*"))))
-        controller.Path(cache).mkdir(exist_ok=True)
-        (controller.Path(cache) / "program").touch()
-        controller.Path(folder).mkdir(exist_ok=True)
-        (controller.Path(folder) / "metrics.json").write_text('{"realtime_factor": 4.0}')
+        commands.append(command[1:])
+        cache = controller.Path(env["JAX_COMPILATION_CACHE_DIR"])
+        caches.append((cache, sorted(cache.parent.glob("cache/*"))))
+        cache.mkdir(exist_ok=True)
+        (cache / "program").touch()
+        if "--out" in command:
+            folder = controller.Path(command[command.index("--out") + 1])
+            folder.mkdir(exist_ok=True)
+            (folder / "metrics.json").write_text('{"realtime_factor": 4.0}')
 
     monkeypatch.setattr(controller.subprocess, "run", run)
     found = controller.start_up("trot.toml")
-    assert [len(programs) for _, programs in caches] == [0, 1]
-    assert caches[0][0] == caches[1][0]
+    walk = ["-m", "kjax.studies.closed_loop", "trot.toml"]
+    assert [command[:3] for command in commands[:2]] == [walk] * 2
+    assert [len(programs) for _, programs in caches] == [0] + [1] * (len(commands) - 1)
+    assert len({cache for cache, _ in caches}) == 1
+    assert commands[2][0] == "-c", "the README's lines"
+    assert commands[2] == commands[3]
+    assert ["-m", "kjax", "doctor"] in commands
     assert found["second_run_realtime_factor"] == 4.0
-    assert min(found["first_run_s"], found["second_run_s"]) > 0.0
+    assert min(found.values()) > 0.0
+    assert {"doctor_s", "own_loop_first_s", "own_loop_second_s", "switch_video_run_s"} <= set(found)
