@@ -434,9 +434,9 @@ def main() -> None:
     for name in PAGES:
         page = ROOT / name
         before = page.read_text(encoding="utf-8")
-        after = refreshed(before)
-        if after != before:
-            page.write_text(after, encoding="utf-8")
+        wanted = refreshed(before)
+        if wanted != before:
+            page.write_text(wanted, encoding="utf-8")
             print(f"{name}: tables written again")
     conventions(ROOT / "docs" / "images" / "conventions.png")
 

@@ -185,14 +185,14 @@ def save_study(
     *,
     file: str = "metrics.json",
 ) -> None:
-    """What a study leaves: its numbers with their provenance, a table and a figure; says so.
+    """What a study leaves: its results with their provenance, a table and a figure; says so.
 
     Args:
       folder: of the study.
-      record: its numbers.
+      record: its results.
       text: the table, Markdown.
       draw: writes the figure to a path.
-      file: name of the numbers' file.
+      file: name of the results' file.
     """
     save_json(folder / file, {"provenance": provenance(), **record})
     write_text(folder / "table.md", text)

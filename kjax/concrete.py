@@ -1,6 +1,6 @@
 """Whether values are known or traced, and the array library that suits them.
 
-What is computed once, from numbers that are known, is computed in NumPy: in JAX each operation is a
+What is computed once, from values that are known, is computed in NumPy: in JAX each operation is a
 program of its own that has to be compiled.
 """
 
@@ -18,7 +18,7 @@ def is_concrete(tree: Any) -> bool:
 
 
 def array_library(*values: Any) -> ModuleType:
-    """NumPy where all values are NumPy arrays or plain numbers, ``jax.numpy`` otherwise."""
+    """NumPy where all values are NumPy arrays or plain floats, ``jax.numpy`` otherwise."""
     known = not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(values))
     return np if known else jnp
 

@@ -1,7 +1,7 @@
 """Threads of BLAS, which jaxlib's LAPACK calls: one is enough, and on a busy machine far faster.
 
 OpenBLAS takes a thread per core and waits for all of them by spinning. Where another program keeps
-a core busy, a QR factorisation of 5 x 10,000 x 34 numbers takes 1.2 s then, and 26 ms with one
+a core busy, a QR factorisation of 5 x 10,000 x 34 entries takes 1.2 s then, and 26 ms with one
 thread.
 """
 

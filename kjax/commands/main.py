@@ -20,7 +20,7 @@ VERBS = {
     "run": ("kjax.studies.closed_loop", "walk a config in MuJoCo: metrics, figure, video"),
     "fit": ("kjax.studies.koopman_fit", "fit Koopman models and test them (the paper's Fig. 3)"),
     "sweep": ("kjax.studies.sweep", "closed loops over a grid or a sample of configs, times seeds"),
-    "reproduce": ("kjax.studies.reproduce.study", "all of the paper's figures and numbers"),
+    "reproduce": ("kjax.studies.reproduce.study", "all of the paper's figures and results"),
     "envelope": (
         "kjax.studies.envelope",
         "limits of each gait: speed, blocks, pushes, friction",

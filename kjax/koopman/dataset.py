@@ -134,8 +134,8 @@ def sample(
     pieces = -(-steps // hold)
     draw = jax.random.uniform(key, (rollouts, 6 + 4 + 4 * pieces), minval=-1.0, maxval=1.0)
     x0 = ranges.state_centre[None] + ranges.state_half[None] * draw[:, :6]
-    moved = ranges.feet_half[None, None] * draw[:, 6:10].reshape(rollouts, 2, 2)
-    feet = params.feet[None] + moved
+    shift = ranges.feet_half[None, None] * draw[:, 6:10].reshape(rollouts, 2, 2)
+    feet = params.feet[None] + shift
     middle = 0.5 * (ranges.input_low + ranges.input_high)
     half = 0.5 * (ranges.input_high - ranges.input_low)
     inputs = middle[None, None] + half[None, None] * draw[:, 10:].reshape(rollouts, pieces, 4)

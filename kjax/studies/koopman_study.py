@@ -135,13 +135,13 @@ def ranges_of(
     state_half: tuple[float, ...], force_half: tuple[float, float], body: srb_planar.SrbParams
 ) -> SampleRanges:
     """Sampling ranges about standing, forces about half the weight per leg."""
-    centre = jnp.array([0.0, float(body.mass) * GRAVITY / 2] * 2)
+    middle = jnp.array([0.0, float(body.mass) * GRAVITY / 2] * 2)
     half = jnp.array([*force_half] * 2)
     return SampleRanges(
         state_centre=jnp.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0]),
         state_half=jnp.array(state_half),
-        input_low=centre - half,
-        input_high=centre + half,
+        input_low=middle - half,
+        input_high=middle + half,
         feet_half=jnp.zeros(2),
     )
 

@@ -104,5 +104,5 @@ def test_a_bootstrap_of_a_mean_is_scipy_s():
 
 def test_paired_samples_are_drawn_together():
     values = np.random.default_rng(1).uniform(1.0, 9.0, 30)
-    ends = bootstrap(lambda a, b: b.mean(axis=1) / a.mean(axis=1), values, 2.0 * values)
-    np.testing.assert_allclose(ends, 2.0, rtol=1e-12)  # 2 in every draw; apart, it would spread
+    interval = bootstrap(lambda a, b: b.mean(axis=1) / a.mean(axis=1), values, 2.0 * values)
+    np.testing.assert_allclose(interval, 2.0, rtol=1e-12)  # 2 in every draw; apart, it would spread

@@ -118,8 +118,8 @@ def test_a_fallen_robot_is_flagged_and_frozen(both):
     on_mjx, in_c = both
     assert on_mjx.fell.tolist() == in_c.fell.tolist() == [False, False, False, True]
     assert on_mjx.ticks[3] == in_c.ticks[3] < 60
-    after = on_mjx.qpos[on_mjx.ticks[3] :, 3]
-    np.testing.assert_array_equal(after, np.broadcast_to(after[0], after.shape))
+    later = on_mjx.qpos[on_mjx.ticks[3] :, 3]
+    np.testing.assert_array_equal(later, np.broadcast_to(later[0], later.shape))
     assert len(on_mjx.trajectory(3).time) == on_mjx.ticks[3]
 
 
