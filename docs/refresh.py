@@ -4,7 +4,8 @@
     python docs/refresh.py --notebooks     # runs them, minutes
 
 A table stands between two comments, ``<!-- table: NAME -->`` and ``<!-- end -->``; NAME is a
-function below, which reads JSON in ``docs/results/``. A test compares them with what stands there.
+function below, which reads JSON in ``docs/results/``. Sentences that quote a
+number are in ``docs/quotes.py``. A test compares all of them with what stands there.
 """
 
 import json
@@ -14,10 +15,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parent))
+from quotes import QUOTES, SHORT
+
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 PAGES = ("README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+PLACEHOLDER = re.compile(r"\{([^{}|]+?) \| (?:([\d.e+-]+) \* )?([^{} ]+)\}")
+NUMBER = r"(-?\d[\d.]*\d(?:e-?\d+)?|\d)"
 
 LIMIT = 300_000  # bytes of an executed notebook
 
@@ -346,9 +353,43 @@ def reproduction() -> str:
     return f"Recorded {recorded('reproduce', 'results.json')}.\n\n{text}\n"
 
 
-def refreshed(text: str) -> str:
-    """A page with its tables as the results have them."""
-    return BLOCK.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], text)
+def refreshed(text: str, page: str = "") -> str:
+    """A page with its tables and quoted numbers as the results have them.
+
+    Raises:
+      ValueError: for a sentence of ``docs/quotes.py`` that the page does not have, or has twice.
+    """
+    text = BLOCK.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], text)
+    for quote in QUOTES.get(page, ()):
+        text = _requoted(text, quote, page)
+    return text
+
+
+def _requoted(text: str, quote: str, page: str) -> str:
+    for name, path in SHORT.items():
+        quote = quote.replace(name, path)
+    parts = PLACEHOLDER.split(quote)  # words, then path, factor, format, and words again
+    words = [r"\s+".join(map(re.escape, re.split(r"\s+", part))) for part in parts[::4]]
+    found = list(re.finditer(NUMBER.join(words), text))
+    if len(found) != 1:
+        raise ValueError(f"{page}: {len(found)} times, wanted once: {quote}")
+    fields = zip(parts[1::4], parts[2::4], parts[3::4], strict=True)
+    for group, field in reversed(list(enumerate(fields, start=1))):
+        begin, end = found[0].span(group)
+        text = text[:begin] + value(*field) + text[end:]
+    return text
+
+
+def value(path: str, factor: str | None, form: str) -> str:
+    """A recorded value, by the folder and the keys that lead to it."""
+    name, *keys = path.split("/")
+    file = next(
+        f for f in ("metrics.json", "results.json", "seeds.json") if (RESULTS / name / f).exists()
+    )
+    found = load(name, file)
+    for key in keys:
+        found = found[int(key)] if isinstance(found, list) else found[key]
+    return f"{float(factor or 1) * found:{form}}"
 
 
 def conventions(path: Path) -> None:
@@ -434,7 +475,7 @@ def main() -> None:
     for name in PAGES:
         page = ROOT / name
         before = page.read_text(encoding="utf-8")
-        wanted = refreshed(before)
+        wanted = refreshed(before, name)
         if wanted != before:
             page.write_text(wanted, encoding="utf-8")
             print(f"{name}: tables written again")

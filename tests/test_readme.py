@@ -36,15 +36,27 @@ def refresh(repository):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_tables_of_a_page_are_those_of_the_recorded_results(repository, refresh, page):
+def test_tables_and_quoted_numbers_are_those_of_the_recorded_results(repository, refresh, page):
     text = (repository / page).read_text(encoding="utf-8")
-    assert refresh.refreshed(text) == text, "run: python docs/refresh.py"
+    assert refresh.refreshed(text, page) == text, "run: python docs/refresh.py"
 
 
 def test_a_number_that_is_not_recorded_is_found(repository, refresh):
     text = (repository / "README.md").read_text(encoding="utf-8")
     assert "**0.0128**" in text
     assert refresh.refreshed(text.replace("**0.0128**", "**0.0100**")) == text
+    text = (repository / "docs" / "models.md").read_text(encoding="utf-8")
+    wrong = re.sub(r"stream\s+through \d+ MB", "stream through 7 MB", text)
+    assert wrong != text
+    assert refresh.refreshed(wrong, "docs/models.md").split() == text.split()
+
+
+def test_a_sentence_that_quotes_results_must_stand_on_its_page_once(repository, refresh):
+    text = (repository / "docs" / "models.md").read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match=r"docs/models.md: 2 times, wanted once: stream through"):
+        refresh.refreshed(f"{text}\nstream through 7 MB.", "docs/models.md")
+    with pytest.raises(ValueError, match=r"docs/models.md: 0 times, wanted once"):
+        refresh.refreshed("nothing", "docs/models.md")
 
 
 def test_every_page_is_on_the_site(repository):
