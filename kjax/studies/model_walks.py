@@ -267,8 +267,14 @@ def figure(found: dict[str, Any], path: Path) -> None:
                 at = np.arange(len(own)) + shift
                 ax.errorbar(value, at, xerr=[value - low, high - value], fmt="o", ms=4,
                             label=legend)  # fmt: skip
-            low, high = np.nanmin(seen), np.nanmax(seen)
+            # One far beyond the others would press them together: its value stands at the edge.
+            shown = np.where(np.array(seen) > 2 * np.nanmedian(seen), np.nan, seen)
+            low, high = np.nanmin(shown), np.nanmax(shown)
             ax.set_xlim(low - 0.15 * (high - low), high + 0.15 * (high - low))
+            for values, shift in zip(seen, (-0.12, 0.12), strict=True):
+                for place in np.flatnonzero(values > 2 * np.nanmedian(seen)):
+                    ax.annotate(f"{values[place]:.2g} →", (1.0, place + shift), ha="right",
+                                va="center", xycoords=("axes fraction", "data"))  # fmt: skip
             ax.set(xlabel=label, title=gait)
             ax.grid(axis="x", alpha=0.3)
         row[0].set_yticks(range(len(own)), [entry["model"] + _falls(entry) for entry in own],
