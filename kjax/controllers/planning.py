@@ -220,7 +220,7 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
             ),
             horizon.Stances(
                 ground=jnp.zeros_like(task.lag),
-                feet=_contacts(params.robot, task) + body.x[:2],
+                feet=_contacts(params.robot, task) + body.x[None, :2],
                 duration=schedule.duration[clock.gait, nodes.phase],
                 cycle=nodes.end[-1],
             ),
@@ -302,7 +302,7 @@ def _contacts(robot: RobotParams, task: ForceTask) -> Float[Array, "2 2"]:
     A pair without a stance foot gets its swing feet, which no force acts on.
     """
     sole = jnp.stack([jnp.zeros_like(robot.foot_radius), robot.foot_radius])
-    pairs = (task.body.feet - sole - task.body.x[:2]).reshape(2, 2, 2)
+    pairs = (task.body.feet - sole[None] - task.body.x[None, :2]).reshape(2, 2, 2)
     weight = task.stance.reshape(2, 2).astype(pairs.dtype)
     weight = jnp.where(weight.sum(axis=1, keepdims=True) > 0, weight, 1.0)
     return (pairs * weight[..., None]).sum(axis=1) / weight.sum(axis=1)[:, None]

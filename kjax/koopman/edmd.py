@@ -9,7 +9,7 @@ steps.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -235,12 +235,8 @@ def stack_bodies(
       feet: (n, 2, 2) front and rear contact points (x, z), body frame [m].
     """
     count = len(feet)
-    leaves: Any = (
-        np.full(count, mass, float),
-        np.full(count, inertia, float),
-        np.asarray(feet, float),
-    )
-    return srb_planar.SrbParams(*leaves)
+    leaves = np.full(count, mass, float), np.full(count, inertia, float), np.asarray(feet, float)
+    return srb_planar.SrbParams(*jax.device_put(leaves))  # compiles nothing
 
 
 @full_precision

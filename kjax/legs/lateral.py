@@ -127,7 +127,7 @@ def stance_forces(
     """
     forces = rotate_back(body.heading, planned)
     below = jnp.stack([jnp.zeros_like(body.com[0])] * 2 + [robot.foot_radius])
-    arms = rotate_back(body.heading, body.feet - below - body.com)
+    arms = rotate_back(body.heading, body.feet - below[None] - body.com[None])
     wrench = wrench_map(arms, stance) @ forces.reshape(-1)
     wrench = wrench.at[jnp.array([1, 3, 5])].set(
         jnp.stack(
