@@ -7,7 +7,6 @@ the program with exit code 2 and one line.
 
 import contextlib
 import dataclasses
-import difflib
 import io
 import re
 import sys
@@ -22,7 +21,7 @@ import tyro
 
 from kjax.config import GaitConfig, RunConfig, fields, load_config
 from kjax.config.gaits import LIBRARY
-from kjax.config.loading import replacement_of
+from kjax.config.loading import nearest_key, replacement_of
 from kjax.config.shipped import find_config
 from kjax.robots import get_robot
 
@@ -210,8 +209,8 @@ def _fail_unknown(name: str, known: Sequence[str]) -> NoReturn:
     became = replacement_of(name)
     if became:
         fail(f"--{name}: {became}")
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    fail(f"unknown option --{name}" + (f"; did you mean --{near[0]}?" if near else ""))
+    near = nearest_key(name, known)
+    fail(f"unknown option --{name}" + (f"; did you mean --{near}?" if near else ""))
 
 
 def _of_own_gait(name: str) -> bool:

@@ -6,7 +6,8 @@ import numpy as np
 
 from kjax import RunConfig
 from kjax.concrete import array_library, is_concrete, stacked
-from kjax.controllers.resolve import fit_models, gather
+from kjax.controllers.resolve import gather
+from kjax.controllers.resolve_fits import fit_models
 from kjax.robots import go1
 
 

@@ -61,6 +61,12 @@ def message(overrides, cls=RunConfig, path=None):
             ("gaits.bound.switch_rule", "did you mean 'first_flight'"),
         ),
         ({"gaits.trot.perod": 0.4}, ("gaits.trot.perod", "did you mean 'gaits.trot.period'")),
+        ({"gaits.amble.dutty": 0.4}, ("gaits.amble.dutty", "did you mean 'gaits.amble.duty'")),
+        ({"gaits.trot.offset": 0.5}, ("gaits.trot.offset: got 0.5, wanted a list of 4 numbers",)),
+        ({"gaits.trot.Q": [1.0]}, ("gaits.trot.Q: got [1.0], wanted a list of 6 numbers",)),
+        ({"lmpc.Q": [0.0] * 7}, ("lmpc.Q: got [0.0, ", "wanted a list of 6 numbers")),
+        ({"command.v_x": 0.3}, ("command.v_x: got 0.3, wanted a list of numbers",)),
+        ({"gait.names": "trot"}, ("gait.names: got 'trot', wanted a list of names",)),
         ({"gaits.trot.duty": [0.5, 0.5, 0.5, 1.2]}, ("gaits.trot.duty", "1.2", "or equal to 1")),
         ({"gaits.trot.offset": [0.0, 1.0, 0.0, 0.0]}, ("gaits.trot.offset", "1.0", "less than 1")),
         (

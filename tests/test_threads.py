@@ -14,7 +14,7 @@ FIT = """
 import jax, numpy as np
 from threadpoolctl import threadpool_info
 from kjax import RunConfig, resolve
-from kjax.controllers import resolve as module
+from kjax.controllers import resolve_fits as module
 
 seen = []
 def watched(*args, **options):

@@ -1,9 +1,11 @@
-"""``kjax study NAME``: studies that no verb of their own starts."""
+"""``kjax study NAME``: studies that no verb of their own starts, and users' own."""
 
 import sys
 from collections.abc import Sequence
+from types import FunctionType
 
-from kjax.options import fail
+from kjax.lookup import look_up
+from kjax.options import fail, program
 
 STUDIES = {
     "invariance": "does a walk depend on where zero is, on its floor, its heading, float32?",
@@ -25,8 +27,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help"):
         print("usage: kjax study NAME [options]\n")
         print("\n".join(f"  {name:14} {text}" for name, text in STUDIES.items()))
+        print("\n  module:main    a study of your own; its folder in PYTHONPATH")
         return 0
-    if words[0] not in STUDIES:
-        fail(f"kjax study {words[0]}: wanted one of {', '.join(STUDIES)}")
-    module = _PACKAGES.get(words[0], f"kjax.studies.{words[0]}")
-    return start_module(module, f"kjax study {words[0]}", words[1:])
+    name, called = words[0], f"kjax study {words[0]}"
+    if ":" in name:
+        try:
+            main = look_up("study", name, STUDIES, FunctionType)
+        except ValueError as error:
+            fail(str(error))
+        with program(called):
+            return int(main(words[1:]))
+    if name not in STUDIES:
+        fail(f"{called}: wanted one of {', '.join(STUDIES)}, or 'module:main' for your own")
+    return start_module(_PACKAGES.get(name, f"kjax.studies.{name}"), called, words[1:])

@@ -5,8 +5,9 @@ import difflib
 import json
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
@@ -235,8 +236,8 @@ def _explain(error: ValidationError, cls: type) -> str:
             return f"{old}: {RETIRED[old]}"
         names = {name for name, _, _ in fields(cls)}
         names |= {name.rsplit(".", 1)[0] for name in names if "." in name}
-        near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
+        near_key = nearest_key(key, names)
+        hint = f"; did you mean '{near_key}'?" if near_key else ""
         text = f"{key}: unknown key (got {_short(came)}){hint}"
     elif first["type"].startswith("missing") and isinstance(first["loc"][-1], str):
         text = f"{key}: missing, it has no default"
@@ -245,11 +246,38 @@ def _explain(error: ValidationError, cls: type) -> str:
         text = f"{key}: {wish}" if key else wish
     else:
         wish = first["msg"].removeprefix("Input should be ")
+        if first["type"] in ("tuple_type", "missing", "too_long"):
+            rest = [error for error in rest if error["type"] != "missing"]
+            key = ".".join(part for part in loc if not part.isdecimal())
+            wish = _wanted_list(cls, key) or wish
         options = [str(o) for o in first.get("ctx", {}).get("expected", "").split("'")[1::2]]
         near = difflib.get_close_matches(str(came), options, n=1, cutoff=0.5)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         text = f"{key}: got {_short(came)}, wanted {wish}{hint}"
     return text + (f" (and {len(rest)} more)" if rest else "")
+
+
+def nearest_key(key: str, known: Iterable[str]) -> str | None:
+    """The config key that was probably meant: one of the same gait, where it is a gait's."""
+    *section, leaf = key.split(".")
+    if len(section) == 2 and section[0] == "gaits":
+        leaves = {name for name, _, _ in fields(GaitConfig)}
+        near = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.5)
+        return ".".join([*section, *near]) if near else None
+    near = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
+    return near[0] if near else None
+
+
+def _wanted_list(cls: type, key: str) -> str | None:
+    """The list that a key wants, in words: "a list of 4 numbers"; ``None`` where it wants none."""
+    known = chain(fields(cls), fields(GaitConfig, f"{key.rpartition('.')[0]}."))
+    kind = next((info.annotation for name, info, _ in known if name == key), None)
+    options = (kind, *get_args(kind))
+    entries = next((get_args(one) for one in options if get_origin(one) is tuple), None)
+    if entries is None:
+        return None
+    noun = "names" if entries[0] is str else "numbers"
+    return f"a list of {noun}" if entries[-1] is ... else f"a list of {len(entries)} {noun}"
 
 
 def _short(value: Any) -> str:

@@ -59,7 +59,7 @@ class SweepConfig:
     """A sweep over configs: ``axes`` name what varies, ``set`` says what becomes of it."""
 
     base: str
-    """TOML file of a closed loop, seen from the sweep's own file [-]."""
+    """Shipped config of a closed loop by its name, or a TOML file seen from the sweep's own [-]."""
     axes: Annotated[dict[str, AxisConfig], Field(min_length=1)]
     """What varies: name and values; the order is that of the dimensions [-]."""
     set: dict[str, Any] = Field(default_factory=dict)

@@ -1,6 +1,5 @@
 """From a config to what a controller is made of: its spec (static) and its parameters (data)."""
 
-import warnings
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -14,11 +13,12 @@ from jaxtyping import Array, Float
 from kjax import gait
 from kjax.concrete import array_library, stacked
 from kjax.config import CommandConfig, Overlay, RunConfig
-from kjax.config.gaits import gait_setting, reachable_gaits
+from kjax.config.gaits import gait_setting
 from kjax.config.units import InSi, in_si
 from kjax.controllers.params import ControllerParams, Fits
-from kjax.controllers.resolve_model import koopman_keys, model_choice, resolve_model
-from kjax.controllers.rigid_body import body_numbers, levers, mean_force, own_body
+from kjax.controllers.resolve_fits import fit_models, warn_of_fits
+from kjax.controllers.resolve_model import resolve_model
+from kjax.controllers.rigid_body import body_numbers, levers, mean_force
 from kjax.controllers.walkable import (
     Problem,
     build_gaits,
@@ -27,18 +27,12 @@ from kjax.controllers.walkable import (
     cycle_nodes,
 )
 from kjax.gait.reference import SAMPLES, periodic_reference
-from kjax.gait.schedule import schedule_arrays
-from kjax.koopman.edmd import Point, fit_modes, stack_bodies
 from kjax.legs import lateral, swing
 from kjax.mpc import horizon
 from kjax.mpc.lmpc import ModeSettings
-from kjax.prediction.build import build_prediction
-from kjax.prediction.evaluation import force_response_error
-from kjax.prediction.kind import ModelChoice, get_kind
 from kjax.robots import get_robot
 from kjax.spec import ControllerSpec, CycleSpec
-from kjax.threads import one_blas_thread
-from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, Mode, RobotParams, contact_mode
+from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, RobotParams, contact_mode
 
 
 def resolve(
@@ -65,7 +59,7 @@ def resolve(
     check_walkable(config, robot)
     with jax.enable_x64(True):
         fits = fit_models(config, robot)
-        _warn_of_fits(config, robot, fits)
+        warn_of_fits(config, robot, fits)
         return spec, jax.device_get(gather(config, robot, fits))
 
 
@@ -120,101 +114,6 @@ def controller_key(config: RunConfig) -> Hashable:
     )
 
 
-def fit_models(config: RunConfig, robot: RobotParams) -> Fits:
-    """Fit the Koopman models of a config; call it in float64.
-
-    Configs that differ elsewhere, in weights or bounds, share one fit.
-    """
-    si = in_si(config, robot)
-    gaits = build_gaits(si)
-    problems, _ = contact_problems(gaits, si)
-    names = [gaits[problem.gait].name for problem in problems]
-    feet = tuple(_nominal_feet(si, robot, name) for name in names)
-    modes = tuple(problem.mode for problem in problems)
-    choice = model_choice(si.koopman)
-    with koopman_keys():
-        of_height = get_kind(choice.model).of_height
-    heights = tuple(gait_setting(si, name, "body_height") if of_height else 0.0 for name in names)
-    # What a file holds may have changed since.
-    fit = _fit.__wrapped__ if choice.file else _fit
-    mass, inertia = (float(number) for number in body_numbers(si, robot))
-    with koopman_keys():
-        return fit(mass, inertia, choice, si.koopman.dataset.seed, modes, feet, heights)
-
-
-def _nominal_feet(config: InSi, robot: RobotParams, name: str) -> tuple[Point, Point]:
-    """Contact points (x, z) of front and rear legs from the centre of mass, standing still [m]."""
-    own, height = config.gaits[name], gait_setting(config, name, "body_height")
-    if own.foothold_front is None or own.foothold_rear is None:
-        front, rear = own_body(config.srb, robot, height).feet.tolist()
-        return tuple(front), tuple(rear)
-    sole = float(robot.foot_radius - height)
-    return (own.foothold_front, sole), (-own.foothold_rear, sole)
-
-
-@lru_cache(maxsize=32)
-def _fit(
-    mass: float,
-    inertia: float,
-    choice: ModelChoice,
-    seed: int,
-    modes: tuple[Mode, ...],
-    feet: tuple[tuple[Point, Point], ...],
-    heights: tuple[float, ...],
-) -> Fits:
-    body = stack_bodies(mass, inertia, feet)
-    key = jax.random.key(seed)
-    with one_blas_thread():
-        model, report = jax.device_get(
-            _fit_modes(
-                body,
-                key,
-                modes=modes,
-                dictionary=choice.dictionary,
-                dataset=choice.dataset,
-                measured_feet=choice.measured_feet,
-            )
-        )
-    if not report.finite.all():
-        raise ValueError("dataset: the EDMD fit is not finite, check its ranges and srb")
-    prediction = None
-    if get_kind(choice.model).params is not None:
-        prediction = build_prediction(body, choice, key, modes=modes, heights=heights)
-    spread = report.residual_rms if prediction is None else prediction.spread
-    return jax.device_get(Fits(model, body.feet, spread, prediction))
-
-
-def _warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
-    """Warn of a linear EDMD model that an LMPC over this horizon should not rely on."""
-    if get_kind(config.koopman.model).params is not None:
-        return
-    gaits = build_gaits(config)
-    walked = reachable_gaits(config.gaits, config.gait.names)
-    mass, inertia = (float(number) for number in body_numbers(config, robot))
-    bodies = jax.device_get(stack_bodies(mass, inertia, fits.feet))
-    duration = config.lmpc.model_dt * config.lmpc.horizon
-    for index, (g, mode) in enumerate(contact_problems(gaits, config)[0]):
-        if mode == Mode.FLIGHT or gaits[g].name not in walked:
-            continue
-        model, body = (jax.tree.map(lambda a, i=index: a[i], part) for part in (fits.model, bodies))
-        error = force_response_error(
-            model,
-            body,
-            MODE_ALPHA[mode],
-            steps=round(duration / config.koopman.dataset.dt),
-            duration=duration,
-        )
-        if error > 1.0:
-            warnings.warn(
-                f"koopman: over the LMPC's {duration:g} s the velocity that the fitted model of "
-                f"{gaits[g].name} ({mode.name.lower()}) predicts for a held force is {error:.1f} "
-                "times the rigid body's response away from it, so it may throw the robot over; try "
-                "fewer powers (koopman.order), more koopman.dataset.rollouts or another "
-                "koopman.dataset.seed",
-                stacklevel=3,
-            )
-
-
 def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> ControllerParams:
     """Parameters from a config, or an ``Overlay`` with traced values, and its fits."""
     si = in_si(config, robot)
@@ -236,7 +135,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
         uncertainty_discount=_number(si.lmpc.uncertainty_discount),
         friction=_number(si.lmpc.friction),
         torque_fraction=_number(si.lmpc.torque_fraction),
-        schedule=schedule_arrays(gaits),
+        schedule=gait.build_schedule(gaits),
         gait_times=_number(si.gait.times),
         reference=_reference_tables(gaits, si, robot),
         multiphase=multiphase_params(gaits, si, robot),
@@ -280,9 +179,6 @@ def build_command(command: CommandConfig) -> Command:
     columns = [getattr(command, name) or [0.0] * len(command.times) for name in COMMAND_NAMES]
     values = np.stack([np.asarray(column, float) for column in columns], axis=-1)
     return Command(np.asarray(command.times, float), values)  # type: ignore[arg-type]
-
-
-_fit_modes = jax.jit(fit_modes, static_argnames=("dictionary", "dataset", "measured_feet", "modes"))
 
 
 def _column(config: InSi, names: Sequence[str], key: str) -> Array:
@@ -402,8 +298,8 @@ def _reference_tables(gaits: list[gait.Gait], config: InSi, robot: RobotParams) 
     return stacked(rows)
 
 
-def _foothold_offset(robot: RobotParams, own: Any) -> Array:
+def _foothold_offset(robot: RobotParams, own: Any) -> Any:
     """Foothold of a gait ahead of the hip, standing still, for each leg [m]."""
     if own.foothold_front is None:
-        return stacked(np.zeros(4))
+        return np.zeros(4)
     return stacked([own.foothold_front] * 2 + [-own.foothold_rear] * 2) - robot.hip_pos[:, 0]

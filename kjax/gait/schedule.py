@@ -164,11 +164,6 @@ class Clock(NamedTuple):
 
 def build_schedule(gaits: list[Gait]) -> Schedule:
     """Stack gaits into one schedule; works out touchdown and stance times per leg."""
-    return jax.tree.map(jnp.asarray, schedule_arrays(gaits))
-
-
-def schedule_arrays(gaits: list[Gait]) -> Schedule:
-    """The same in NumPy, so that nothing has to be compiled."""
     if not gaits or not all(gait.phases for gait in gaits):
         raise ValueError("gaits must be a non-empty list of gaits with at least one phase each")
     names = [gait.name for gait in gaits]
@@ -187,23 +182,22 @@ def schedule_arrays(gaits: list[Gait]) -> Schedule:
     def table(value: Callable[[tuple[Phase, ...], int], Any], kind: type = float) -> Any:
         return np.array([[value(*entry) for entry in row] for row in rows], kind)
 
-    leaves: dict[str, Any] = {
-        "may_leave": np.array(leave),
-        "phases": np.array([len(gait.phases) for gait in gaits]),
-        "leave_when_done": np.array([gait.switch_rule != "anywhere" for gait in gaits]),
-        "transition_gait": np.array([names.index(g.transition_gait or g.name) for g in gaits]),
-        "ramp_start": np.array([gait.ramp_start for gait in gaits], float),
-        "ramp_cycles": np.array([gait.ramp_cycles for gait in gaits]),
+    columns: dict[str, Any] = {
+        "phases": [len(gait.phases) for gait in gaits],
+        "duration": table(lambda phases, i: phases[i].duration),
+        "mode": table(lambda phases, i: contact_mode(phases[i].stance), int),
+        "stance": table(lambda phases, i: phases[i].stance, bool),
+        "time_to_touchdown": table(_waits),
+        "flight_to_touchdown": table(_flights),
+        "stance_time": table(_stance_times),
+        "may_leave": leave,
+        "leave_when_done": [gait.switch_rule != "anywhere" for gait in gaits],
+        "transition_gait": [names.index(gait.transition_gait or gait.name) for gait in gaits],
+        "ramp_start": [float(gait.ramp_start) for gait in gaits],
+        "ramp_cycles": [gait.ramp_cycles for gait in gaits],
     }
-    return Schedule(
-        **leaves,
-        duration=table(lambda phases, i: phases[i].duration),
-        mode=table(lambda phases, i: contact_mode(phases[i].stance), int),
-        stance=table(lambda phases, i: phases[i].stance, bool),
-        time_to_touchdown=table(_waits),
-        flight_to_touchdown=table(_flights),
-        stance_time=table(_stance_times),
-    )
+    # Moved in one go, which compiles nothing.
+    return Schedule(**jax.device_put({name: np.array(of) for name, of in columns.items()}))
 
 
 def _steps_to_stance(phases: tuple[Phase, ...], index: int, leg: int) -> int:

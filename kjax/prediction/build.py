@@ -12,7 +12,7 @@ from kjax.prediction import families
 from kjax.prediction.families import Family
 from kjax.prediction.kind import Bodies, ModelChoice, get_kind
 from kjax.spec import ModelSpec
-from kjax.types import MODE_ALPHA, Mode
+from kjax.types import MODE_ALPHA, STATE_DIM, Mode
 
 
 class Prediction(NamedTuple):
@@ -73,11 +73,30 @@ def build_prediction(
       heights: of the centre of mass in each, for what is linearised beforehand [m].
 
     Raises:
-      ValueError: for a file that cannot be used, or a fit that is not finite.
+      ValueError: for a file that cannot be used, a fit that is not finite, and parameters that are
+        not those of each mode.
     """
     make = get_kind(choice.model).params
     if make is None:
         raise ValueError(f"model: '{choice.model}' has its own tables (edmd.fit_modes)")
     alpha = jnp.asarray(MODE_ALPHA[np.array(modes)], float)
     params, spread = make(choice, Bodies(body, alpha, modes, heights, key))
+    _check_shapes(choice.model, params, spread, len(modes))
     return Prediction(params=params, force=jax.vmap(families.hover)(body, alpha), spread=spread)
+
+
+def _check_shapes(model: str, params: Any, spread: Any, modes: int) -> None:
+    """Refuse parameters that are not stacked over the modes: traced code would take any index."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if np.shape(leaf)[:1] != (modes,):
+            name = f"params{jax.tree_util.keystr(path)}"
+            raise ValueError(
+                f"model: {model}: {name} has shape {np.shape(leaf)}, wanted a leading axis of "
+                f"{modes}, the number of bodies.modes"
+            )
+    if np.shape(spread) != (modes, STATE_DIM):
+        got = type(spread).__name__ if spread is None else f"a spread of shape {np.shape(spread)}"
+        raise ValueError(
+            f"model: {model}: params must give parameters and a spread of shape "
+            f"({modes}, {STATE_DIM}), zeros where the model is exact, got {got}"
+        )

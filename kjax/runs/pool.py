@@ -20,6 +20,8 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import RunConfig
+from kjax.prediction.kind import ModelKind, get_kind
+from kjax.robots import Robot, get_robot
 from kjax.runs.cache import Cache
 from kjax.sim.engines.mujoco import MujocoEngine, OnTick, simulate
 from kjax.sim.episode import BatchSpec
@@ -174,7 +176,7 @@ def _episode_of_call(
 
 
 _KEPT = 4  # engines that a process keeps
-_engines: dict[BatchSpec, MujocoEngine] = {}
+_engines: dict[tuple[BatchSpec, Robot, ModelKind], MujocoEngine] = {}
 
 
 def _episode(
@@ -182,13 +184,18 @@ def _episode(
 ) -> dict[str, Any]:
     """Run one episode, on an engine that is kept for those to come."""
     episode = resolve_episode(config)
-    spec = episode.spec
-    if spec not in _engines:
-        while len(_engines) >= _KEPT:
-            del _engines[next(iter(_engines))]
-        _engines[spec] = MujocoEngine(spec)
-    run = simulate(_engines[spec], episode, on_tick=on_tick)
+    run = simulate(_engine(episode.spec), episode, on_tick=on_tick)
     if record is not None and not run.interrupted:
         path.parent.mkdir(parents=True, exist_ok=True)
         record(run, path)
     return metrics(run, episode.goal)
+
+
+def _engine(spec: BatchSpec) -> MujocoEngine:
+    # Names of one's own may stand for another robot or model since, as where a module is reloaded.
+    key = (spec, get_robot(spec.scene.robot), get_kind(spec.controller.model.kind))
+    if key not in _engines:
+        while len(_engines) >= _KEPT:
+            del _engines[next(iter(_engines))]
+        _engines[key] = MujocoEngine(spec)
+    return _engines[key]

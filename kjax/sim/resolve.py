@@ -224,8 +224,10 @@ def _origin(config: RunConfig) -> np.ndarray:
 
 
 def _controller_spec(config: RunConfig) -> ControllerSpec:
-    # What a file holds may have changed since.
-    return controller_spec(config) if config.koopman.file else _cached_spec(config)
+    # A file, or a module of one's own, may have changed since.
+    if config.koopman.file or ":" in config.koopman.model:
+        return controller_spec(config)
+    return _cached_spec(config)
 
 
 @lru_cache(maxsize=8192)

@@ -16,7 +16,8 @@ from jaxtyping import Array
 
 from kjax.config import Gaits, Overlay, RunConfig, Tunable, load_config, to_dict, tunable
 from kjax.controllers.params import ControllerParams, Fits, cast
-from kjax.controllers.resolve import fit_models, gather
+from kjax.controllers.resolve import gather
+from kjax.controllers.resolve_fits import fit_models
 from kjax.controllers.resolve_model import koopman_keys
 from kjax.controllers.rigid_body import body_numbers
 from kjax.prediction.families import BodyModel

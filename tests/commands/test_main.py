@@ -39,6 +39,18 @@ def test_a_verb_gets_the_words_after_it_and_its_exit_code_is_kept(call, monkeypa
     assert seen == [("kjax run", ["trot_velocity", "--duration", "3"])]
 
 
+def test_a_study_of_ones_own_is_found_by_its_name(call, monkeypatch):
+    seen = []
+
+    def own(words):
+        seen.append((called(), list(words)))
+        return 5
+
+    monkeypatch.setitem(sys.modules, "mine", SimpleNamespace(main=own))
+    assert call(kjax, "study", "mine:main", "--seeds", "3") == 5
+    assert seen == [("kjax study mine:main", ["--seeds", "3"])]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -48,6 +60,8 @@ def test_a_verb_gets_the_words_after_it_and_its_exit_code_is_kept(call, monkeypa
         (["sweep"], "CONFIG"),
         (["sweep", "trot_velocity"], "trot_velocity"),
         (["study", "invarience"], "wanted one of invariance"),
+        (["study", "no_module:main"], "cannot be loaded: No module named 'no_module'; is its"),
+        (["study", "kjax.types:GRAVITY"], "is a float, wanted a function"),
         (["configs", "trot"], "no such config"),
         (["bench", "speed"], "which benchmark?"),
     ],

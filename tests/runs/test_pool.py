@@ -39,10 +39,8 @@ def config():
 @pytest.fixture(scope="module", autouse=True)
 def simulation(config):
     """Built once; the runner finds it where a worker would have left it."""
-    built = MujocoEngine(batch_spec(config))
     pool._engines.clear()
-    pool._engines[batch_spec(config)] = built
-    return built
+    return pool._engine(batch_spec(config))
 
 
 def seeds(config, count):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from kjax.config import AxisConfig, ConfigError, RunConfig, SweepConfig, load_config
+from kjax.config.shipped import shipped_config, shipped_names
 from kjax.controllers.walkable import check_walkable
 from kjax.robots import get_robot
 from kjax.sim.metrics import metric_names
@@ -41,7 +42,7 @@ def plan(sweep: SweepConfig, file: Path) -> Plan:
 
     Args:
       sweep: its config.
-      file: that it came from; ``base`` is seen from there.
+      file: that it came from; a ``base`` that is a file is seen from there.
 
     Raises:
       ConfigError: naming the key that no run can be made of, or that no figure can be drawn of,
@@ -70,7 +71,7 @@ def plan(sweep: SweepConfig, file: Path) -> Plan:
             for index in np.ndindex(*shape)
         ]
         coords = {name: ((name,), np.array(values[name]), units[name]) for name in names}
-    base = file.parent / sweep.base
+    base = base_of(sweep, file)
     cases = []
     for point in points:
         keys = {key: _fill(value, point, f"{file}: set.{key}") for key, value in sweep.set.items()}
@@ -81,6 +82,12 @@ def plan(sweep: SweepConfig, file: Path) -> Plan:
     _check_figure(sweep, dims, cases, file)
     coords["seed"] = (("seed",), seeds, "-")
     return Plan(dims=(*dims, "seed"), coords=coords, shape=(*shape, len(seeds)), cases=cases)
+
+
+def base_of(sweep: SweepConfig, file: Path) -> Path:
+    """The closed loop's own config: a file seen from the sweep's, or a shipped one by its name."""
+    path = file.parent / sweep.base
+    return shipped_config(sweep.base) if sweep.base in shipped_names() else path
 
 
 def _check_figure(

@@ -15,7 +15,7 @@ from kjax.config import ConfigError, RunConfig, SweepConfig, load_config, to_dic
 from kjax.files import own_module_hash
 from kjax.runs.cache import Cache, lock
 from kjax.runs.sweeps.dataset import merged, write
-from kjax.runs.sweeps.grid import plan
+from kjax.runs.sweeps.grid import base_of, plan
 from kjax.sim.engines.contract import Engine, get_engine
 from kjax.sim.episode import BatchSpec
 from kjax.sim.resolve import batch_spec, resolve_episodes, resolve_scene
@@ -110,7 +110,7 @@ def run_sweep(
         cache.refresh()
         attributes = {
             "sweep": to_dict(sweep),
-            "base": to_dict(load_config(RunConfig, file.parent / sweep.base)),
+            "base": to_dict(load_config(RunConfig, base_of(sweep, file))),
             "provenance": cli.provenance(),
         }
         dataset = merged(cases, [cache[key] for key in keys], attributes)

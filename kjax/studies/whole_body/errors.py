@@ -10,7 +10,7 @@ import numpy as np
 
 from kjax.config import Gaits, RunConfig, SrbConfig, load_config
 from kjax.config.shipped import shipped_config
-from kjax.controllers.resolve import fit_models
+from kjax.controllers.resolve_fits import fit_models
 from kjax.controllers.resolve_model import resolve_model
 from kjax.controllers.rigid_body import own_body
 from kjax.controllers.walkable import build_gaits, contact_problems

@@ -1,5 +1,7 @@
 """From a sweep's file to its cases, and what it says where that cannot be."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -147,3 +149,14 @@ def test_the_shipped_sweeps_can_be_planned(repository):
 def test_expressions_are_arithmetic():
     names = {"a": 3.0, "b": 2.0}
     assert evaluate("(a + 1) / b - -2 * a", names, "key") == pytest.approx(8.0)
+
+
+def test_the_example_of_the_docs_walks_a_shipped_config_from_any_folder(repository, tmp_path):
+    text = (repository / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    example = re.search(r"```toml\n(.*?)```", text, re.S).group(1)
+    path = tmp_path / "mine.toml"
+    path.write_text(example)
+    cases = plan(load_config(SweepConfig, path), path)
+    assert cases.shape == (3, 32)
+    assert {case.terrain.kind for case in cases.cases} != {"flat"}
+    assert [cases.cases[32 * i].command.v_x[1] for i in range(3)] == [0.2, 0.4, 0.6]
