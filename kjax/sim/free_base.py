@@ -5,7 +5,6 @@ velocity in the world (3,) [m/s], angular velocity in the body (3,) [rad/s], joi
 qpos of the planar base: x, z [m], MuJoCo's angle about +y [rad], joints.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -104,14 +103,13 @@ def sliding_speed(
       rates: (N, 4, 3) their rates [rad/s].
     """
     with jax.enable_x64(True):
-        return np.asarray(_sliding_speed(robot, quat, velocity, joints, rates))
+        return np.asarray(_sole_speeds(robot, quat, velocity, joints, rates))
 
 
-@jax.jit
-@partial(jax.vmap, in_axes=(None, 0, 0, 0, 0))
-def _sliding_speed(
+def sole_speed(
     robot: RobotParams, quat: Array, velocity: Array, joints: Array, rates: Array
 ) -> Array:
+    """The same (4,) of one state, in JAX."""
     hip, trig = spatial.hip_trig(joints), leg_trig(joints)
     R_world_body, omega = spatial.rotation_matrix(quat), velocity[3:]
     foot = robot.hip_pos + spatial.foot_position(robot, hip, trig)
@@ -126,3 +124,6 @@ def _sliding_speed(
     bottom = -robot.foot_radius * R_world_body[2]  # straight down in the world
     world = velocity[:3] + (foot_vel + jnp.cross(omega_calf, bottom)) @ R_world_body.T
     return jnp.hypot(world[:, 0], world[:, 1])
+
+
+_sole_speeds = jax.jit(jax.vmap(sole_speed, in_axes=(None, 0, 0, 0, 0)))

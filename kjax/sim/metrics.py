@@ -3,13 +3,14 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from kjax import qp
 from kjax.robots import Robot, get_robot
 from kjax.sim import free_base
 from kjax.sim.episode import Goal
 from kjax.sim.scene import robot_addresses
+from kjax.sim.tick_stats import TickStats, of_run
 from kjax.sim.trajectory import Trajectory
 from kjax.types import COMMAND_NAMES
 
@@ -32,12 +33,14 @@ def reference_height(
     return goal.heights[gait] + command.values[piece, COMMAND_NAMES.index("height")]
 
 
-def metrics(run: Trajectory, goal: Goal) -> dict[str, Any]:
+def metrics(run: Trajectory, goal: Goal, stats: TickStats | None = None) -> dict[str, Any]:
     """Flat metrics of an episode, the unit in the key.
 
     Args:
       run: the episode.
       goal: what was asked in it.
+      stats: of the physics steps between its samples; its samples themselves if ``None``.
+        Percentiles, roll and yaw, and what concerns fields and switches are of the samples.
     """
     if not isinstance(goal, Goal):
         raise TypeError(
@@ -52,28 +55,32 @@ def metrics(run: Trajectory, goal: Goal) -> dict[str, Any]:
     }
     if not steady.any():
         return result
-    error = run.x[steady, 3] - run.velocity_command[steady]
-    pitch = np.degrees(np.abs(run.x[steady, 2]))
-    height = run.x[steady, 1]
     robot, scene = get_robot(goal.scene.robot), goal.scene
-    saturated = np.abs(run.torque) >= 0.999 * robot.params.torque_limit
-    joints = saturated.any(axis=1).mean(axis=0)
+    if stats is None:
+        slip = slip_path(run, robot, scene.contact_threshold)
+        stats = of_run(run, slip, np.asarray(robot.params.torque_limit))
+    # Ticks whose steps are known: not that of a fall, and none with a number that is not finite.
+    known = (stats.steps > 0) & (run.time[: len(stats.steps)] >= SETTLE_TIME)
+    if not known.any():
+        return result
+    walked, steps = TickStats(*(series[known] for series in stats)), stats.steps[known].sum()
+    joints = stats.saturated_joints.sum(axis=0) / stats.steps.sum()
     unsolved = run.plan_status != qp.Status.SOLVED
     result |= {
-        "velocity_rmse_mps": float(np.sqrt(np.mean(error**2))),
-        "pitch_max_deg": float(pitch.max()),
-        "pitch_p95_deg": float(np.percentile(pitch, 95)),
-        "height_mean_m": float(height.mean()),
-        "height_min_m": float(height.min()),
-        "height_max_m": float(height.max()),
+        "velocity_rmse_mps": float(np.sqrt(walked.command_error.sum() / steps)),
+        "pitch_max_deg": float(np.degrees(walked.pitch.max())),
+        "pitch_p95_deg": float(np.percentile(np.degrees(np.abs(run.x[steady, 2])), 95)),
+        "height_mean_m": float(walked.height.sum() / steps),
+        "height_min_m": float(walked.height_min.min()),
+        "height_max_m": float(walked.height_max.max()),
         "distance_m": float(run.x[-1, 0] - run.x[0, 0]),
-        **_tracking(run, goal),
+        **_tracking(run, goal, stats, known),
         **_crossing(run, goal),
         **_switching(run, goal),
         **free_base.metrics(run.qpos, steady),
-        "foot_slip_m": foot_slip(run, robot, scene.contact_threshold),
-        "torque_max_nm": float(np.abs(run.torque).max()),
-        "torque_saturation_fraction": float(saturated.any(axis=(1, 2)).mean()),
+        "foot_slip_m": float(stats.slip.sum() / _stances(run)),
+        "torque_max_nm": float(stats.torque.max()),
+        "torque_saturation_fraction": float(stats.saturated.sum() / stats.steps.sum()),
         **{
             f"{name}_saturation_fraction": float(value)
             for name, value in zip(("abduction", "thigh", "knee"), joints, strict=True)
@@ -125,28 +132,35 @@ def metric_names(goal: Goal) -> set[str]:
     return names
 
 
-def _tracking(run: Trajectory, goal: Goal) -> dict[str, Any]:
+def _tracking(
+    run: Trajectory, goal: Goal, stats: TickStats, known: Bool[np.ndarray, "P"]
+) -> dict[str, Any]:
     """Speed against what the LMPC is given and late in the run; height against the configured one.
 
     The height is that of the gait in use (for a bound its mean in stance), on flat ground only.
     """
-    steady = run.time >= SETTLE_TIME
-    against = run.x[steady, 3] - run.velocity_reference[steady]
+    time, gait = run.time[: len(known)], run.gait[: len(known)]
     result: dict[str, Any] = {
-        "velocity_reference_rmse_mps": float(np.sqrt(np.mean(against**2))),
+        "velocity_reference_rmse_mps": float(
+            np.sqrt(stats.reference_error[known].sum() / stats.steps[known].sum())
+        ),
     }
-    late = run.time >= max(SETTLE_TIME, goal.command.times[-1] + LATE_TIME)
+    late = known & (time >= goal.command.times[-1] + LATE_TIME)
     if late.any():
-        error = run.x[late, 3] - run.velocity_command[late]
+        steps = stats.steps[late].sum()
         result |= {
-            "velocity_late_mean_mps": float(run.x[late, 3].mean()),
-            "velocity_late_rmse_mps": float(np.sqrt(np.mean(error**2))),
+            "velocity_late_mean_mps": float(stats.velocity[late].sum() / steps),
+            "velocity_late_rmse_mps": float(np.sqrt(stats.command_error[late].sum() / steps)),
         }
     if goal.scene.terrain == "flat":
-        error = run.x[steady, 1] - reference_height(run.gait[steady], run.time[steady], goal)
+        wanted = reference_height(gait[known], time[known], goal)
+        steps = stats.steps[known]
+        extremes = np.stack([stats.height_min[known], stats.height_max[known]]) - wanted
         result |= {
-            "height_error_max_m": float(np.abs(error).max()),
-            "height_error_mean_m": float(abs(error.mean())),
+            "height_error_max_m": float(np.abs(extremes).max()),
+            "height_error_mean_m": float(
+                abs((stats.height[known] - steps * wanted).sum() / steps.sum())
+            ),
         }
     return result
 
@@ -186,10 +200,16 @@ def _switching(run: Trajectory, goal: Goal) -> dict[str, Any]:
 
 
 def foot_slip(run: Trajectory, robot: Robot, threshold: float) -> float:
-    """Mean path that a foot's contact point slides along the ground per stance [m].
+    """Mean path that a foot's contact point slides along the ground per stance [m]."""
+    return float(slip_path(run, robot, threshold).sum() / _stances(run))
+
+
+def slip_path(run: Trajectory, robot: Robot, threshold: float) -> Float[np.ndarray, "N-1"]:
+    """Path along the ground that feet in contact slide from each sample to the next, summed [m].
 
     The foot is a sphere: while the calf turns, its centre moves without slip. What counts is the
-    velocity of the material point at the bottom, v_centre - (d angle / dt) * radius.
+    velocity of the material point at the bottom, v_centre - (d angle / dt) * radius; on the planar
+    base along x only.
     """
     free = free_base.is_free(run.qpos)
     at = robot_addresses(robot, "free" if free else "planar")
@@ -201,8 +221,13 @@ def foot_slip(run: Trajectory, robot: Robot, threshold: float) -> float:
     else:
         angle = run.qpos[:, 2, None] + joints[:, :, 1] + joints[:, :, 2]  # of the calf, about +y
         rolled = robot.params.foot_radius * np.diff(angle, axis=0)
-        slide = np.diff(run.feet[:, :, 0], axis=0) - rolled
+        slide = np.abs(np.diff(run.feet[:, :, 0], axis=0) - rolled)
     touching = run.foot_force > threshold
     pressed = touching[:-1] & touching[1:]
-    stances = np.sum(np.diff(run.stance.astype(int), axis=0) > 0) + run.stance[0].sum()
-    return float(np.abs(slide[pressed]).sum() / max(stances, 1))
+    return np.asarray(np.where(pressed, slide, 0.0).sum(axis=1))
+
+
+def _stances(run: Trajectory) -> int:
+    """Number of stances that began, one at least."""
+    begun = np.sum(np.diff(run.stance.astype(int), axis=0) > 0) + run.stance[0].sum()
+    return max(int(begun), 1)

@@ -9,6 +9,7 @@ import numpy as np
 from kjax.sim.closed_loop import TickLog
 from kjax.sim.episode import Episode
 from kjax.sim.metrics import metrics
+from kjax.sim.tick_stats import TickStats
 from kjax.sim.trajectory import Trajectory
 
 
@@ -33,6 +34,8 @@ class Recording:
       feet: (T, B, 4, 2) foot centres, likewise [m].
       foot_force: (T, B, 4) normal force on the contact sensors [N].
       log: of the controller, leading axes (P, B).
+      stats: of the physics steps between the samples, leading axes (P, B); ``None`` where the
+        samples are all that is known. In the tick of a fall there are none.
       body_contact: (P, B) whether anything but a foot touches the world, or (0, B) where the engine
         does not look.
       plan_time: (P, B) wall time of each call of ``plan``, or (0, B) from a batch [s].
@@ -59,6 +62,7 @@ class Recording:
     act_time: np.ndarray
     wall_time: float
     interrupted: bool = False
+    stats: TickStats | None = None
 
     def trajectory(self, robot: int) -> Trajectory:
         """The episode of one robot."""
@@ -97,7 +101,13 @@ class Recording:
     def metrics(self) -> Iterator[dict[str, Any]]:
         """Metrics of each robot; from a batch without those of wall time."""
         for robot, episode in enumerate(self.episodes):
-            yield metrics(self.trajectory(robot), episode.goal)
+            yield metrics(self.trajectory(robot), episode.goal, self._stats_of(robot))
+
+    def _stats_of(self, robot: int) -> TickStats | None:
+        if self.stats is None:
+            return None
+        whole = int(self.ticks[robot]) - int(self.fell[robot])
+        return TickStats(*(np.asarray(series[:whole, robot], float) for series in self.stats))
 
 
 def recording_of_ticks(
@@ -112,10 +122,11 @@ def recording_of_ticks(
     log: TickLog,
     wall_time: float,
     interrupted: bool,
+    stats: TickStats | None = None,
 ) -> Recording:
     """A batch's recording, sampled at the beginning of each control tick of ``dt``.
 
-    Ten arguments: the fields of ``Recording`` that engines differ in, by keyword.
+    Eleven arguments: the fields of ``Recording`` that engines differ in, by keyword.
     """
     none = np.zeros((0, len(ticks)))
     return Recording(
@@ -137,6 +148,7 @@ def recording_of_ticks(
         act_time=none,
         wall_time=wall_time,
         interrupted=interrupted,
+        stats=stats,
     )
 
 
@@ -160,6 +172,7 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
     def whole(name: str) -> np.ndarray:
         return np.concatenate([getattr(one, name) for one in recordings])
 
+    stats = [one.stats for one in recordings if one.stats is not None]
     series = ("qpos", "qvel", "torque", "x", "feet", "foot_force")
     per_call = ("body_contact", "plan_time", "act_time")
     return Recording(
@@ -171,6 +184,11 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
         fell=whole("fell"),
         log=TickLog(*map(along, zip(*(one.log for one in recordings), strict=True))),
         **{name: along([getattr(one, name) for one in recordings]) for name in series + per_call},
+        stats=(
+            TickStats(*map(along, zip(*stats, strict=True)))
+            if len(stats) == len(recordings)
+            else None
+        ),
         wall_time=sum(one.wall_time for one in recordings),
         interrupted=any(one.interrupted for one in recordings),
     )

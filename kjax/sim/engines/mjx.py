@@ -41,17 +41,22 @@ from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, recording_of_ticks
 from kjax.sim.scene import build_spec
+from kjax.sim.tick_stats import TickStats, Window
 
 _PIECE = 50  # control ticks of one compiled call; between two of them Ctrl-C and progress
 
 
 class MjxTick(NamedTuple):
-    """What is recorded of a control tick, at its beginning, and the torque in its first step."""
+    """What is recorded of a control tick, at its beginning, the torque in its first step, and more.
+
+    ``stats``: of its physics steps.
+    """
 
     qpos: Float[Array, "nq"]
     qvel: Float[Array, "nv"]
     torque: Float[Array, "12"]
     log: TickLog
+    stats: TickStats
 
 
 class MjxState(NamedTuple):
@@ -166,6 +171,7 @@ class MjxEngine:
             qvel=record.qvel,
             torque=sign * record.torque[..., legs],
             log=record.log,
+            stats=record.stats,
             wall_time=time.perf_counter() - begin,
             interrupted=interrupted,
         )
@@ -271,27 +277,41 @@ class MjxEngine:
                 lambda new, old: jnp.where(alive, new, old), _same_types(stepped, data), data
             )
 
-        def act(carry: MjxState, _: None) -> tuple[MjxState, Array]:
+        def act(carry: MjxState, _: None) -> tuple[MjxState, tuple[Array, Sensed]]:
             data, robot, under_way, at = carry
             robot, torque = loop.act(tables, robot, loop.noise(params, at), _sensed(data))
             under_way, applied = delayed_torque(under_way, torque, at // unit, params.delay // unit)
 
-            def onward(data: Any, i: Array) -> tuple[Any, None]:
-                return physics(data, applied, at + i, robot.alive), None
+            def onward(data: Any, i: Array) -> tuple[Any, Sensed]:
+                return physics(data, applied, at + i, robot.alive), _sensed(data)
 
             if unit == 1:
+                before = jax.tree.map(lambda a: a[None], _sensed(data))
                 data = physics(data, applied, at, robot.alive)
             else:
-                data, _ = jax.lax.scan(onward, data, jnp.arange(unit, dtype=jnp.int32))
-            return MjxState(data, robot, under_way, at + unit), torque
+                data, before = jax.lax.scan(onward, data, jnp.arange(unit, dtype=jnp.int32))
+            return MjxState(data, robot, under_way, at + unit), (torque, before)
 
         def tick(carry: MjxState, _: None) -> tuple[MjxState, MjxTick]:
             data, robot, under_way, at = carry
             noise = loop.noise(params, at)
             robot, log = loop.plan(tables, params.origin, robot, noise, _sensed(data))
             carry = MjxState(data, robot, under_way, at)
-            after, torques = jax.lax.scan(act, carry, None, length=self._per_tick // unit)
-            return after, MjxTick(data.qpos, data.qvel, torques[0], log)
+            calls = self._per_tick // unit
+            after, (torques, before) = jax.lax.scan(act, carry, None, length=calls)
+            states = jax.tree.map(
+                lambda steps, last: jnp.concatenate([steps.reshape(-1, last.size), last[None]]),
+                before,
+                _sensed(after.data),
+            )
+            window = Window(
+                qpos=states.qpos,
+                qvel=states.qvel,
+                sensordata=states.sensordata,
+                torque=jnp.repeat(torques, unit, axis=0),
+            )
+            stats = loop.stats(tables, params.origin, after.walk, window)
+            return after, MjxTick(data.qpos, data.qvel, torques[0], log, stats)
 
         return jax.lax.scan(tick, state, None, length=_PIECE)
 

@@ -44,6 +44,7 @@ from kjax.sim.episode import (
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, empty_log, recording_of_ticks
 from kjax.sim.scene import apply_world, build_model
+from kjax.sim.tick_stats import TickStats, Window, empty_stats
 
 _WAIT = 0.1  # s between two looks at the threads
 
@@ -55,11 +56,13 @@ class Calls(NamedTuple):
       init: (tables, params, sensed) -> state.
       first: (tables, params, state, step, sensed) -> (state, torque, log); plan and act.
       then: the same without plan -> (state, torque).
+      stats: (tables, params, state, window) -> stats of the tick.
     """
 
     init: Callable[..., LoopState]
     first: Callable[..., tuple[LoopState, Any, TickLog]]
     then: Callable[..., tuple[LoopState, Any]]
+    stats: Callable[..., TickStats]
 
 
 class BatchEngine:
@@ -141,6 +144,7 @@ class BatchEngine:
             np.concatenate(arrays, axis=1)[:, : len(episodes)]
             for arrays in zip(*(d[2:] for d in done), strict=True)
         ]
+        stats = len(TickStats._fields)
         return recording_of_ticks(
             episodes,
             self.spec.controller.control_dt,
@@ -149,7 +153,8 @@ class BatchEngine:
             qpos=series[0],
             qvel=series[1],
             torque=series[2],
-            log=TickLog(*series[3:]),
+            log=TickLog(*series[3:-stats]),
+            stats=TickStats(*series[-stats:]),
             wall_time=wall,
             interrupted=interrupted,
         )
@@ -178,11 +183,15 @@ class BatchEngine:
             def then(tables: Any, params: Any, state: Any, step: Any, sensed: Any) -> Any:
                 return loop.act(tables, state, loop.noise(params, step), sensed)
 
+            def stats(tables: Any, params: Any, state: Any, window: Any) -> Any:
+                return loop.stats(tables, params.origin, state, window)
+
             self._calls[key] = Calls(
                 init=jax.jit(jax.vmap(init, (axes, 0, 0))),
                 # The old state is given up, so that what stays the same is not copied.
                 first=jax.jit(jax.vmap(first, (axes, 0, 0, None, 0)), donate_argnums=2),
                 then=jax.jit(jax.vmap(then, (axes, 0, 0, None, 0)), donate_argnums=2),
+                stats=jax.jit(jax.vmap(stats, (axes, 0, 0, 0))),
             )
         return self._calls[key]
 
@@ -230,7 +239,7 @@ class _Group:
         self._delay = params.delay // self._unit
         self.fell_at = np.full(count, self.ticks)
         self.fell = np.zeros(count, bool)
-        self._state: Any = None
+        self._window = self._empty_window()
         self._record: list[Any] = []
 
     def sensed(self) -> Sensed:
@@ -249,7 +258,8 @@ class _Group:
         state, *rest = self._calls.first(self._tables, self._params, state, step, sensed)
         if self._unit < self._per_tick:
             state, *rest = self._calls.then(self._tables, self._params, state, step, sensed)
-        jax.block_until_ready((state, rest))
+        stats = self._calls.stats(self._tables, self._params, state, self._window)
+        jax.block_until_ready((state, rest, stats))
 
     def walk(self) -> None:
         """All ticks, until told to stop."""
@@ -258,6 +268,7 @@ class _Group:
         alive = np.ones(len(self.fell), bool)
         ids: np.ndarray | None = None  # all
         series: tuple[np.ndarray, ...] = ()
+        stats = empty_stats(self.ticks, len(alive), self._dtype)
         for tick in range(self.ticks):
             if self._stop.is_set() or not alive.any():
                 break
@@ -281,16 +292,29 @@ class _Group:
                 ids = np.flatnonzero(alive)
                 if not len(ids):
                     break
-            for i in range(0, self._per_tick, self._unit):
-                if i > 0:
-                    state, torque = self._calls.then(
-                        tables, params, state, np.int32(step + i), self.sensed()
-                    )
-                    torque = np.asarray(torque)
-                self._apply(torque, step + i)
-                self._advance(ids, alive)
+            state = self._steps(state, torque, step, ids)
+            found = self._calls.stats(tables, params, state, self._window)
+            for array, value in zip(stats, found, strict=True):
+                array[tick] = value
             self.done = tick + 1
-        self._record = list(series)
+        self._record = [*series, *stats]
+
+    def _steps(
+        self, state: LoopState, torque: np.ndarray, step: int, ids: np.ndarray | None
+    ) -> LoopState:
+        """The physics steps of a tick, which are left in the window."""
+        for i in range(0, self._per_tick, self._unit):
+            if i > 0:
+                state, later = self._calls.then(
+                    self._tables, self._params, state, np.int32(step + i), self.sensed()
+                )
+                torque = np.asarray(later)
+            self._apply(torque, step + i)
+            for j in range(i, i + self._unit):
+                self._note(j, torque)
+                self._advance(ids)
+        self._note(self._per_tick)
+        return state
 
     def _apply(self, torque: np.ndarray, step: int) -> None:
         """Torques, delayed, and pushes for the physics steps from ``step`` on."""
@@ -303,13 +327,34 @@ class _Group:
         if self._pushed:
             self._pushes[:] = push_at(self._params, step, self._unit)
 
-    def _advance(self, ids: np.ndarray | None, alive: np.ndarray) -> None:
-        """Physics of the robots that are alive."""
+    def _note(self, place: int, torque: np.ndarray | None = None) -> None:
+        """Keep the state before a step of the tick, or after its last, and the torque."""
+        window = self._window
+        window.qpos[:, place], window.qvel[:, place] = self._qpos, self._qvel
+        window.sensordata[:, place] = self._sensordata
+        if torque is not None:
+            window.torque[:, place] = torque
+
+    def _advance(self, ids: np.ndarray | None) -> None:
+        """A physics step of the robots that are alive."""
         try:
-            self._batch.step(ids=ids, nstep=self._unit)
+            self._batch.step(ids=ids)
         except mujoco.batch.SimulationError as error:
             # They kept their state: make it one that counts as a fall in the next tick.
             self._qpos[np.asarray(error.ids)] = np.nan
+
+    def _empty_window(self) -> Window:
+        count, n = len(self.fell), self._per_tick
+
+        def states(field: np.ndarray) -> np.ndarray:
+            return np.zeros((count, n + 1, field.shape[1]), self._dtype)
+
+        return Window(
+            qpos=states(self._qpos),
+            qvel=states(self._qvel),
+            sensordata=states(self._sensordata),
+            torque=np.zeros((count, n, self._ctrl.shape[1]), self._dtype),
+        )
 
     def _arrays(self, log: TickLog) -> tuple[np.ndarray, ...]:
         count = len(self.fell)

@@ -91,6 +91,9 @@ def test_three_tenths_of_a_second_of_trot_agree(both):
         np.testing.assert_allclose(on_mjx.torque[:, i], in_c.torque[:, i], atol=1000 * near)
         np.testing.assert_allclose(on_mjx.log.x[:, i], in_c.log.x[:, i], atol=100 * near)
         np.testing.assert_array_equal(on_mjx.log.stance[:, i], in_c.log.stance[:, i])
+        for ours, theirs in zip(on_mjx.stats, in_c.stats, strict=True):
+            np.testing.assert_allclose(ours[:, i], theirs[:, i], atol=1000 * near)
+    assert (in_c.stats.steps[:, :3] == 5).all()
     assert (on_mjx.log.status[:, :3] == 0).all()
     assert in_c.log.stance[0, 0].tolist() == [True, False, False, True]
     assert in_c.log.stance[-1, 0].tolist() == [False, True, True, False]
