@@ -246,6 +246,71 @@ for _name in ("benchmark_simulation", "benchmark_qp", "benchmark_edmd", "benchma
     table(_copied(_name))
 
 
+@table
+def qp_box() -> str:
+    """The box QPs of a walk, beside other solvers."""
+    found = load("benchmark_qp")
+    gaits = ("trot_velocity", "bound_velocity")
+    box = {name: [found["box"][gait][name]["us_median"] for gait in gaits]
+           for name in found["box"][gaits[0]]}  # fmt: skip
+    batch = {name: [found["batch"][gait]["1024"][name] for gait in gaits]
+             for name in ("kjax", "daqp loop")}  # fmt: skip
+
+    def cells(*names: str) -> tuple[str, ...]:
+        return tuple(" / ".join(f"{box[name][i]:.3g}" for name in names) for i in range(len(gaits)))
+
+    return markdown(
+        ("", "trot", "bound"),
+        [
+            ("kjax in a scan, warm", *cells("kjax in a scan, value")),
+            ("the same with its gradient", *cells("kjax in a scan, value and gradient")),
+            ("daqp, warm / cold", *cells("daqp, warm", "daqp, cold")),
+            ("kjax, 1,024 at once, cold", *(f"{us:.3g}" for us in batch["kjax"])),
+            ("daqp, a loop over 1,024", *(f"{us:.3g}" for us in batch["daqp loop"])),
+            ("kjax, one call from Python, warm", *cells("kjax tableau, warm")),
+            ("an empty jitted call with the same arguments", *cells("empty jitted call")),
+            ("quadprog / OSQP 1e-6 / PIQP", *cells("quadprog", "OSQP 1e-6", "PIQP")),
+            ("qpax / Clarabel", *cells("qpax", "Clarabel")),
+        ],
+    )
+
+
+@table
+def qp_rows() -> str:
+    """QPs with rows, a new Hessian in every call."""
+    rows = {name: f"{one['us_median']:.3g}" for name, one in load("benchmark_qp")["rows"].items()}
+    pairs = (
+        ("kjax active set / interior point", ("kjax active_set", "kjax interior_point")),
+        ("daqp / ProxQP warm / PIQP", ("daqp, cold", "ProxQP, warm", "PIQP")),
+    )
+    return markdown(
+        ("30 variables, 60 rows, H new in every call: bound through flight",
+         "one call from Python"),
+        [(text, " / ".join(rows[name] for name in names)) for text, names in pairs],
+    )  # fmt: skip
+
+
+@table
+def simulation() -> str:
+    """Closed loops in batches beside the bare engines."""
+    found = load("benchmark_simulation")
+
+    def row(text: str, one: dict[str, float]) -> tuple[str, ...]:
+        rates = (f"{one[name]:,.0f}" for name in ("robot_steps_per_s", "bare_robot_steps_per_s"))
+        return text, *rates, f"{one['over_bare']:.2f}"
+
+    names = {"held": "torques held", "every_step": "torques at every step"}
+    rows = []
+    for key, one in found["c"].items():
+        gait, torques, robots = key.split(", ")
+        rows.append(row(f"C, {gait}, {names[torques]}, {int(robots):,} robots", one))
+    for robots, one in found["mjx"].items():
+        rows.append(row(f"MJX in float32, trot, torques at every step, {int(robots):,}", one))
+    alone = f"{found['python_loop']['robot_steps_per_s']:,.0f}"
+    rows.append(("C, trot, one robot after the other in Python", alone, "", ""))
+    return markdown(("robot-steps per second, two threads", "closed loop", "bare engine", ""), rows)
+
+
 def _as_left(name: str) -> Callable[[], str]:
     """The table of a study, as its command leaves it."""
 

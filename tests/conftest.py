@@ -10,9 +10,9 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("NPROC", "1")  # see kjax.cli.configure_jax
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see kjax.threads
 # Compiling is most of the time. LLVM's optimisations cost a third of it, XLA's newer emitter of
-# fused loops more than half of the rest (8.3 s to 3.3 s for ``solve_rows``). Scripts that tests
-# start run for longer, and get what users get. A flag that XLA does not know ends the process.
-given = os.environ.get("XLA_FLAGS")
+# fused loops more than half of the rest (8.3 s to 3.3 s for ``solve_rows``). A flag that XLA does
+# not know ends the process. Where a test's subject is not the LMPC's rows, its config has the box
+# alone (friction and torque_fraction of inf), which compiles in a third of the time.
 FLAGS = ["--xla_backend_optimization_level=0"]
 if version("jaxlib") == "0.10.2":  # that of constraints.txt
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")
@@ -34,8 +34,6 @@ jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / "
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 jax.block_until_ready(jax.jit(lambda x: x + 1)(0.0))  # XLA has read its flags now
-if given is None:
-    del os.environ["XLA_FLAGS"]
 
 # Shapes and dtypes of annotated arguments are checked in tests only, so before kjax is imported.
 CHECKED = (

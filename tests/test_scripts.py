@@ -138,7 +138,8 @@ def test_a_run_leaves_metrics_config_trajectory_and_figure(start, tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_writes_what_was_simulated(start, tmp_path):
-    process = start("closed_loop.py", "--duration", 2000, "--out", tmp_path)
+    box = ("--lmpc.friction", "inf", "--lmpc.torque_fraction", "inf")
+    process = start("closed_loop.py", "--duration", 2000, *box, "--out", tmp_path)
     assert "compiled" in process.stdout.readline()
     time.sleep(2)  # in the loop, far from its end
     process.send_signal(signal.SIGINT)

@@ -7,6 +7,7 @@ under ``vmap`` alike. The caller owns ``jit``.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -87,10 +88,13 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
     act = build_act(base, spec.act_dt)
 
     def init(tables: Tables, observation: Observation) -> ControllerState:
-        return _init(base, init_from, tables, observation)
+        return _init(start, tables, observation)
 
     def init_from(tables: Tables, view: View, track: Array | None = None) -> ControllerState:
         return _init_from(spec, tables, view, track)
+
+    # Most callers call ``init`` once, outside jit: one program, not a hundred and forty.
+    start = jax.jit(full_precision(partial(_start, base, init_from)))
 
     def plan(
         tables: Tables, state: ControllerState, observation: Observation
@@ -122,15 +126,22 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
 
 
 def _init(
-    base: Base, init_from: Callable[..., ControllerState], tables: Tables, observation: Observation
+    start: Callable[..., ControllerState], tables: Tables, observation: Observation
 ) -> ControllerState:
-    """``Controller.init``."""
+    """``Controller.init``: a look at the sample where it is known, and ``start``."""
     if not isinstance(tables, Tables):
         raise TypeError(f"tables: wanted condense(spec, params), got {type(tables).__name__}")
     params = tables.params
     if is_concrete((observation, params.robot)):
         check_observation(params.robot, observation)
-    observation = cast(observation, params.position_slack.dtype)
+    return start(tables, cast(observation, params.position_slack.dtype))
+
+
+def _start(
+    base: Base, init_from: Callable[..., ControllerState], tables: Tables, observation: Observation
+) -> ControllerState:
+    """The state before the first tick."""
+    params = tables.params
     # The heading of a first sample that is no good is taken from the first good one.
     valid = is_valid(observation)
     observation = or_neutral(observation, valid)

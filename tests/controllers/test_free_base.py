@@ -222,14 +222,13 @@ def test_the_heading_to_keep_is_that_of_the_first_valid_sample(free, tables):
     np.testing.assert_array_equal(again.track, state.track)
 
 
-def test_the_gradient_through_act_is_finite_on_the_free_base(tables):
+def test_the_gradient_through_act_is_finite_on_the_free_base(tables, free):
     """Swing legs press with nothing, where a root has no derivative."""
-    controller = build_controller(controller_spec(FREE))
     seen = disturbed(0)
-    state, _ = controller.plan(tables, controller.init(tables, seen), seen)
+    state, _ = free.plan(tables, free.init(tables, seen), seen)
 
     def cost(tables, seen):
-        return jnp.sum(controller.act(tables, state, seen)[1].torque ** 2)
+        return jnp.sum(free.act(tables, state, seen)[1].torque ** 2)
 
     slopes = jax.jit(jax.grad(cost, (0, 1), allow_int=True))(tables, seen)
     for leaf in jax.tree.leaves(slopes):

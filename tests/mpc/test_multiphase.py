@@ -24,6 +24,9 @@ FRONT, FIRST_FLIGHT, REAR, SECOND_FLIGHT = range(4)
 DURATION = (0.1, 0.1, 0.05, 0.1)  # s
 
 
+predict = jax.jit(horizon.predict)
+
+
 @pytest.fixture(scope="module")
 def config():
     keys = {
@@ -76,7 +79,7 @@ def forecast_of(params):
     """Forecast for given nodes, state and command, on flat ground."""
 
     def build(nodes, x, velocity=0.0, command=0.0, slew=2.0, contact=((0.05, 0.0), (-0.1, 0.0))):
-        return horizon.predict(
+        return predict(
             params,
             nodes,
             x,

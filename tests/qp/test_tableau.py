@@ -14,6 +14,8 @@ from kjax.qp import Status
 from kjax.qp.problem import swept
 
 N = 12
+# Outside jit each operation is a program of its own.
+prepare, solve_once = jax.jit(qp.prepare), jax.jit(qp.solve)
 
 
 def chain(seed, ticks, *, condition=1e3, size=N):
@@ -53,7 +55,7 @@ def by_daqp(H, q, lower, upper):
 
 def test_carried_through_two_thousand_ticks_it_stays_exact():
     H, q, lower, upper = chain(0, 2000)
-    solutions = solve_chain(qp.prepare(H), q, lower, upper)
+    solutions = solve_chain(prepare(H), q, lower, upper)
     assert (solutions.status == Status.SOLVED).all()
     np.testing.assert_allclose(solutions.x, by_daqp(H, q, lower, upper), atol=1e-8)
     active = ((solutions.x == lower[None]) | (solutions.x == upper[None])).sum(axis=1)
@@ -81,8 +83,8 @@ def test_in_float32_drift_is_repaired_before_it_shows():
 @pytest.mark.parametrize("ill", ["nan", "another problem's", "wrong sides"])
 def test_a_spoilt_warm_start_costs_time_only(ill):
     H, q, lower, upper = chain(2, 2)
-    prepared = qp.prepare(H)
-    warm = qp.solve(prepared, q[0], lower, upper).warm
+    prepared = prepare(H)
+    warm = solve_once(prepared, q[0], lower, upper).warm
     if ill == "nan":
         warm = warm._replace(table=warm.table * jnp.nan)
     elif ill == "another problem's":
@@ -125,7 +127,7 @@ def test_known_fixed_variables_save_their_exchanges():
 @pytest.mark.parametrize("count", [3, 40])  # within one chunk, and in several with a rest
 def test_a_batch_over_stacked_hessians_gives_what_single_calls_give(count):
     problems = [chain(seed, count) for seed in range(2)]
-    prepared = jax.vmap(qp.prepare)(jnp.stack([p[0] for p in problems]))
+    prepared = jax.vmap(prepare)(jnp.stack([p[0] for p in problems]))
     which = jnp.arange(count) % 2
     q = jnp.stack([problems[i % 2][1][i] for i in range(count)])
     lower, upper = problems[0][2:]
@@ -178,7 +180,7 @@ def test_derivatives_of_the_box_qp_agree_with_finite_differences(box_gradients, 
         H, q, lower, upper = chain(seed, 1, condition=100.0)
         # A fixed variable, whose bounds move together.
         problem = [H, q[0], lower.at[0].set(0.05), upper.at[0].set(0.05)]
-        if qp.solve(qp.prepare(H), *problem[1:]).margin < 1e-3:
+        if solve_once(prepare(H), *problem[1:]).margin < 1e-3:
             continue
         slopes = gradients[method](*problem)
         rng = np.random.default_rng(seed)
@@ -224,7 +226,7 @@ def test_forward_and_reverse_mode_agree_through_scan_and_vmap():
 def test_a_weakly_active_bound_shows_in_the_margin_and_takes_one_side():
     prepared = qp.prepare(jnp.eye(2))
     lower, upper = jnp.zeros(2), jnp.ones(2)
-    solve = partial(qp.solve, prepared, lower=lower, upper=upper)
+    solve = partial(solve_once, prepared, lower=lower, upper=upper)
     at_edge = solve(jnp.array([0.0, -0.5]))  # the unconstrained minimiser lies on the bound
     assert at_edge.margin == 0.0
     assert solve(jnp.array([0.2, -0.5])).margin > 0.1

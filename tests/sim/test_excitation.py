@@ -20,6 +20,8 @@ SHORT = {
     "sim.contacts": "feet",
     "noise.force": 12.0,
     "seed": 5,
+    "lmpc.friction": np.inf,
+    "lmpc.torque_fraction": np.inf,
 }
 
 

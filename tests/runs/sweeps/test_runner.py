@@ -38,7 +38,7 @@ unit = "m/s"
 
 @pytest.fixture
 def file(tmp_path):
-    (tmp_path / "walk.toml").write_text("")
+    (tmp_path / "walk.toml").write_text("[lmpc]\nfriction = inf\ntorque_fraction = inf\n")
     path = tmp_path / "sweep.toml"
     path.write_text(SWEEP)
     return path

@@ -22,6 +22,8 @@ COMMON = {
     "terrain.count": 2,
     "terrain.start": 0.45,
     "terrain.end": 0.7,
+    "lmpc.friction": np.inf,
+    "lmpc.torque_fraction": np.inf,
 }
 # A robot each of its own field, friction, payload, delay, push and command; the last one falls.
 OWN = (

@@ -124,6 +124,7 @@ def assert_metrics_of_the_physics_rate(of_batch, of_single):
 
 def test_metrics_between_the_samples_count_on_the_free_base_as_well():
     keys = {"sim.base": "free", "duration": 1.0, "sim.contacts": "feet"}
+    keys |= {"lmpc.friction": np.inf, "lmpc.torque_fraction": np.inf}
     config = load_config(RunConfig, None, keys | {"command.v_x": [0.3] * 5})
     episode = resolve_episode(config)
     batch = BatchEngine(episode.spec, torques="held", dtype=np.float64, threads=1).run([episode])
