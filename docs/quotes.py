@@ -1,7 +1,8 @@
 """Sentences of the docs that quote results: what stands in braces comes from ``docs/results``.
 
 Each is a piece of a page, with ``{FOLDER/KEY/KEY | FORMAT}`` for a number; the format may begin
-with a factor, as in ``1e3 * .1f``. ``docs/refresh.py`` writes the numbers, a test compares them.
+with a factor, as in ``1e3 * .1f``, and the keys may end in ``min`` or ``max`` of a list.
+``docs/refresh.py`` writes the numbers, a test compares them.
 """
 
 SHORT = {
@@ -11,6 +12,8 @@ SHORT = {
     "$edmd": "benchmark_edmd",
     "$learn": "learn_control",
     "$tuned": "tune_bound/mujoco",
+    "$s/": "sweeps/",
+    "$held": "reproduce/experiments/bound_rough",
 }
 
 QUOTES: dict[str, tuple[str, ...]] = {
@@ -38,6 +41,48 @@ QUOTES: dict[str, tuple[str, ...]] = {
         "{$starts/scheduled nominal, rms/0 | .3f} m/s before anything is learned, and to "
         "{$starts, against the frozen nominal/scheduled touchdown/0/0 | .2f} of it with a residual",
         "during pushes (with them {$trotall, during pushes as well/clock_history/0/0 | .2f} for",
+    ),
+    "docs/sweeps.md": (
+        "the pitch is {$s/bound_to_trot/switch_pitch_max_deg/value/0/max | .1f}° and settles in "
+        "{$s/bound_to_trot/pitch_settle_s/value/0/max | .2f} s; at once it is "
+        "{$s/bound_to_trot/switch_pitch_max_deg/value/1/min | .1f} to "
+        "{$s/bound_to_trot/switch_pitch_max_deg/value/1/max | .1f}°, and settles in "
+        "{$s/bound_to_trot/pitch_settle_s/value/1/min | .2f} to "
+        "{$s/bound_to_trot/pitch_settle_s/value/1/max | .2f} s.",
+        "at 0.6 and 0.8 m/s in {$s/trot_rough/success/value/3/2 | 100 * .0f} and "
+        "{$s/trot_rough/success/value/4/2 | 100 * .0f} %;",
+        "the paper's field {$s/trot_rough_1024/episodes_per_point | .0f} times: "
+        "{$s/trot_rough_1024/success/value/0 | 1024 * .0f} cross",
+        "20 N s at four of them ({$s/push_bound/success/value/3/3 | 100 * .0f}, "
+        "{$s/push_bound/success/value/3/2 | 100 * .0f} and "
+        "{$s/push_bound/success/value/3/5 | 100 * .0f} % succeed at the others)",
+        "at 8 cm {$s/bound_rough/success/value/0/2 | 100 * .0f} % at 0.3 m/s and "
+        "{$s/bound_rough/success/value/1/2 | 100 * .0f} to "
+        "{$s/bound_rough/success/value/3/2 | 100 * .0f} % faster;",
+        "Pitch grows from {$s/bound_rough/field_pitch_p95_deg/value/min | .0f} to "
+        "{$s/bound_rough/field_pitch_p95_deg/value/max | .0f}°.",
+        "{$s/bound_timing/success/value/0/1 | 100 * .0f} % at 0.35 s and all at 0.4 s, with "
+        "{$s/bound_timing/pitch_p95_deg/value/0/2 | .0f}° to "
+        "{$s/bound_timing/pitch_p95_deg/value/0/1 | .0f}° of pitch. Short cycles pitch less: "
+        "{$s/bound_timing/pitch_p95_deg/value/3/0 | .1f}° at 0.35 x 0.3 s, "
+        "{$s/bound_timing/pitch_p95_deg/value/1/2 | .0f}° at 0.25 x 0.4 s.",
+        "costs height ({$s/model_error/height_error_mean_m/value/5/0 | 1e3 * .0f} mm at 6 kg)",
+        "(off by {$s/model_inertia/height_error_mean_m/value/0/2 | 1e3 * .0f} and "
+        "{$s/model_inertia/height_error_mean_m/value/4/2 | 1e3 * .0f} mm at both ends",
+    ),
+    "docs/results.md": (
+        "{$held/planar/held/cost/crossed/difference | -100 * .1f} % of the fields on the planar "
+        "base (an interval of {$held/planar/held/cost/crossed/high | -100 * .1f} to "
+        "{$held/planar/held/cost/crossed/low | -100 * .1f} %) and "
+        "{$held/free/held/cost/crossed/difference | -100 * .1f} % "
+        "({$held/free/held/cost/crossed/high | -100 * .1f} to "
+        "{$held/free/held/cost/crossed/low | -100 * .1f} %) on the free one: "
+        "{$held/free/held/cost/crossed/held | .0f} of 256 crossed.",
+        "({$held/free/summary/velocity_reference_rmse_mps/median | .3f} and "
+        "{$held/planar/summary/velocity_reference_rmse_mps/median | .3f} against the slewed "
+        "reference)",
+        "The roll reaches {$s/bound_rough_roll/roll_max_deg/value/min | .0f} to "
+        "{$s/bound_rough_roll/roll_max_deg/value/max | .0f}°",
     ),
     "docs/tuning.md": (
         "Median ratio {benchmark_gradient/grad_over_value | .1f};",

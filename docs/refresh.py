@@ -291,6 +291,25 @@ def qp_rows() -> str:
 
 
 @table
+def roll_regulator() -> str:
+    """Gains of the rough bound's roll regulator."""
+    found = load("sweeps", "bound_rough_roll.json")
+
+    def cell(i: int, j: int) -> str:
+        share, low, high = (100 * found["success"][part][i][j] for part in ("value", "low", "high"))
+        return f"{share:.0f} ({low:.0f} to {high:.0f})"
+
+    damping = [f"damping {d:g} N m s/rad" for d in found["damping"]]
+    return markdown(
+        ("share that crosses [%]", *damping),
+        [
+            (f"stiffness {k:g} N m/rad", *(cell(i, j) for j in range(len(damping))))
+            for i, k in enumerate(found["stiffness"])
+        ],
+    )
+
+
+@table
 def simulation() -> str:
     """Closed loops in batches beside the bare engines."""
     found = load("benchmark_simulation")
@@ -448,13 +467,28 @@ def _requoted(text: str, quote: str, page: str) -> str:
 def value(path: str, factor: str | None, form: str) -> str:
     """A recorded value, by the folder and the keys that lead to it."""
     name, *keys = path.split("/")
-    file = next(
-        f for f in ("metrics.json", "results.json", "seeds.json") if (RESULTS / name / f).exists()
-    )
+    if name == "sweeps":
+        file = f"{keys.pop(0)}.json"
+    else:
+        file = next(
+            f
+            for f in ("metrics.json", "results.json", "seeds.json")
+            if (RESULTS / name / f).exists()
+        )
     found = load(name, file)
     for key in keys:
-        found = found[int(key)] if isinstance(found, list) else found[key]
+        if key in ("min", "max"):
+            found = {"min": min, "max": max}[key](_numbers(found))
+        else:
+            found = found[int(key)] if isinstance(found, list) else found[key]
     return f"{float(factor or 1) * found:{form}}"
+
+
+def _numbers(nested: Any) -> list[float]:
+    """All numbers of nested lists."""
+    if isinstance(nested, list):
+        return [number for one in nested for number in _numbers(one)]
+    return [] if nested is None else [nested]
 
 
 def conventions(path: Path) -> None:
