@@ -1,14 +1,18 @@
-"""The controllers of a batch as one set of tables, with an axis where its robots differ."""
+"""What the robots of a batch share: tables with an axis where they differ, and compiled scenes."""
 
 from collections.abc import Hashable, Sequence
+from copy import copy
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from kjax.controllers.params import Tables, condense
+from kjax.robots import Robot
 from kjax.sim.episode import Episode
+from kjax.sim.scene import apply_world
 from kjax.types import Command
 
 
@@ -74,6 +78,21 @@ def rows_of(tables: Tables, axes: Any, rows: slice) -> Tables:
         tables,
         is_leaf=lambda a: a is None,
     )
+
+
+def scene_models(
+    robot: Robot, model: mujoco.MjModel, episodes: Sequence[Episode]
+) -> list[mujoco.MjModel]:
+    """A copy of the scene for each episode's world; equal ones once."""
+    made: dict[Hashable, mujoco.MjModel] = {}
+    out = []
+    for episode in episodes:
+        key = episode.world.key()
+        if key not in made:
+            made[key] = copy(model)
+            apply_world(robot, made[key], episode.world)
+        out.append(made[key])
+    return out
 
 
 def _filled(values: Any, count: int, rest: Any) -> np.ndarray:

@@ -187,13 +187,7 @@ def build_closed_loop(
         torque = jnp.asarray(at.sign) * torque
         return state._replace(controller=next_state), torque.reshape(-1)[order]
 
-    read = build_read_window(
-        robot,
-        at,
-        free=own.base == "free",
-        dt=scene.sim_dt,
-        contact_threshold=scene.contact_threshold,
-    )
+    read = build_read_window(base, observe, at, free=own.base == "free", dt=scene.sim_dt)
 
     def stats(tables: Tables, origin: Array, state: LoopState, window: Window) -> TickStats:
         wanted = state.controller.command[0], state.controller.velocity

@@ -92,11 +92,7 @@ def build_observe(robot: Robot, model: mujoco.MjModel, contact_threshold: float)
       contact_threshold: foot force above which a contact counts [N].
     """
     at = find_addresses(robot, model)
-    return observe_at(at, free=model.nq == 19, contact_threshold=contact_threshold)
-
-
-def observe_at(at: Addresses, *, free: bool, contact_threshold: float) -> Observe:
-    """The same for addresses in a model of the free base, or of the planar one."""
+    is_free = model.nq == 19
 
     def observe_free(qpos: Array, qvel: Array, sensordata: Array) -> Observation:
         return Observation(
@@ -122,4 +118,4 @@ def observe_at(at: Addresses, *, free: bool, contact_threshold: float) -> Observ
             contact=sensordata[at.foot_force] > contact_threshold,
         )
 
-    return observe_free if free else observe_planar
+    return observe_free if is_free else observe_planar

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array
 
-from kjax.legs.base import View, build_base
-from kjax.robots import Robot
+from kjax.legs.base import Base, View
 from kjax.sim.free_base import sole_speed
-from kjax.sim.observe import Addresses, observe_at
+from kjax.sim.observe import Addresses, Observe
 from kjax.sim.trajectory import Trajectory
 from kjax.types import RobotParams
 
@@ -134,20 +134,32 @@ def empty_stats(ticks: int, robots: int, dtype: Any) -> TickStats:
     )
 
 
+def empty_window(model: mujoco.MjModel, robots: int, steps: int, dtype: Any) -> Window:
+    """Zeros for the windows of some robots, which are the leading axis."""
+
+    def zeros(rows: int, width: int) -> np.ndarray:
+        return np.zeros((robots, rows, width), dtype)
+
+    return Window(
+        qpos=zeros(steps + 1, model.nq),
+        qvel=zeros(steps + 1, model.nv),
+        sensordata=zeros(steps + 1, model.nsensordata),
+        torque=zeros(steps, model.nu),
+    )
+
+
 def build_read_window(
-    robot: Robot, at: Addresses, *, free: bool, dt: float, contact_threshold: float
+    base: Base, observe: Observe, at: Addresses, *, free: bool, dt: float
 ) -> ReadWindow:
     """Function (params, track, origin, window, command, reference) -> stats of one tick.
 
     Args:
-      robot: who walks; its parameters come with each call.
+      base: that the robot walks on.
+      observe: (qpos, qvel, sensordata) -> observation.
       at: addresses in the model.
       free: whether the base is free.
       dt: physics step [s].
-      contact_threshold: foot force from which on a foot touches the ground [N].
     """
-    base = build_base("free" if free else "planar")
-    observe = observe_at(at, free=free, contact_threshold=contact_threshold)
     legs = at.actuator.reshape(-1)
 
     def read(

@@ -23,9 +23,10 @@ from kjax.bench.timing import Call, elapsed, interleaved, median_ratio, reported
 from kjax.config import RunConfig, load_config
 from kjax.config.shipped import shipped_config
 from kjax.robots import get_robot
+from kjax.sim.batching import scene_models
 from kjax.sim.engines.mjx import MjxEngine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.engines.mujoco_batch import BatchEngine, scene_models
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import Episode, initial_state
 from kjax.sim.mjx_import import mjx
 from kjax.sim.observe import find_addresses

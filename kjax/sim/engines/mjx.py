@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from kjax.controllers.params import Tables
 from kjax.robots import get_robot
-from kjax.sim.batching import stack_tables
+from kjax.sim.batching import scene_models, stack_tables
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop, delayed_torque
 from kjax.sim.engines.contract import (
     OnProgress,
@@ -27,7 +27,6 @@ from kjax.sim.engines.contract import (
     require_one_batch,
     require_options,
 )
-from kjax.sim.engines.mujoco_batch import scene_models
 from kjax.sim.episode import (
     BatchSpec,
     Episode,

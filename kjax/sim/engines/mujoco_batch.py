@@ -10,9 +10,8 @@ that of a single run to the last bit.
 
 import os
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from copy import copy
 from threading import Event
 from typing import Any, NamedTuple
 
@@ -23,8 +22,8 @@ import mujoco.batch
 import numpy as np
 
 from kjax.controllers.params import Tables
-from kjax.robots import Robot, get_robot
-from kjax.sim.batching import rows_of, stack_tables
+from kjax.robots import get_robot
+from kjax.sim.batching import rows_of, scene_models, stack_tables
 from kjax.sim.closed_loop import LoopState, Sensed, TickLog, build_closed_loop
 from kjax.sim.engines.contract import (
     OnProgress,
@@ -43,8 +42,8 @@ from kjax.sim.episode import (
 )
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, empty_log, recording_of_ticks
-from kjax.sim.scene import apply_world, build_model
-from kjax.sim.tick_stats import TickStats, Window, empty_stats
+from kjax.sim.scene import build_model
+from kjax.sim.tick_stats import TickStats, empty_stats, empty_window
 
 _WAIT = 0.1  # s between two looks at the threads
 
@@ -239,7 +238,7 @@ class _Group:
         self._delay = params.delay // self._unit
         self.fell_at = np.full(count, self.ticks)
         self.fell = np.zeros(count, bool)
-        self._window = self._empty_window()
+        self._window = empty_window(model, count, self._per_tick, self._dtype)
         self._record: list[Any] = []
 
     def sensed(self) -> Sensed:
@@ -343,19 +342,6 @@ class _Group:
             # They kept their state: make it one that counts as a fall in the next tick.
             self._qpos[np.asarray(error.ids)] = np.nan
 
-    def _empty_window(self) -> Window:
-        count, n = len(self.fell), self._per_tick
-
-        def states(field: np.ndarray) -> np.ndarray:
-            return np.zeros((count, n + 1, field.shape[1]), self._dtype)
-
-        return Window(
-            qpos=states(self._qpos),
-            qvel=states(self._qvel),
-            sensordata=states(self._sensordata),
-            torque=np.zeros((count, n, self._ctrl.shape[1]), self._dtype),
-        )
-
     def _arrays(self, log: TickLog) -> tuple[np.ndarray, ...]:
         count = len(self.fell)
         qpos, qvel = (np.zeros((self.ticks, *field.shape)) for field in (self._qpos, self._qvel))
@@ -389,21 +375,6 @@ def _run_threads(groups: list[_Group], stop: Event, on_progress: OnProgress | No
     for future in futures:
         future.result()
     return interrupted
-
-
-def scene_models(
-    robot: Robot, model: mujoco.MjModel, episodes: Sequence[Episode]
-) -> list[mujoco.MjModel]:
-    """A copy of the scene for each episode's world; equal ones once."""
-    made: dict[Hashable, mujoco.MjModel] = {}
-    out = []
-    for episode in episodes:
-        key = episode.world.key()
-        if key not in made:
-            made[key] = copy(model)
-            apply_world(robot, made[key], episode.world)
-        out.append(made[key])
-    return out
 
 
 def _cores() -> int:

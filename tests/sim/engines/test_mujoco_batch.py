@@ -8,8 +8,9 @@ import pytest
 
 from kjax.config import RunConfig, load_config
 from kjax.robots import go1
+from kjax.sim.batching import scene_models
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.engines.mujoco_batch import BatchEngine, scene_models
+from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.metrics import metrics
 from kjax.sim.observe import find_addresses
 from kjax.sim.resolve import (
