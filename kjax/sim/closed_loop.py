@@ -23,7 +23,7 @@ from kjax.sim.episode import BatchSpec, EpisodeParams, SceneSpec
 from kjax.sim.excitation import perturb
 from kjax.sim.noise import add_noise, force_row, sensor_row
 from kjax.sim.observe import build_observe, find_addresses
-from kjax.sim.tick_stats import TickStats, Window, build_read_window
+from kjax.sim.tick_stats import ReadWindow, build_read_window
 from kjax.types import Observation, RobotParams
 
 # Height of the centre of mass over the leg's length; about the trunk lying on the ground.
@@ -100,15 +100,15 @@ class ClosedLoop(NamedTuple):
       plan: (tables, origin, state, noise, sensed) -> (state, log); at the control rate. ``origin``
         is that of the episode.
       act: (tables, state, noise, sensed) -> (state, torque (12,) in actuator order).
-      stats: (tables, origin, state, window) -> stats of the tick that a window holds; with the
-        state after it.
+      stats: (robot, track, origin, window, command, reference) -> stats of the tick that a window
+        holds; ``tick_stats.build_read_window``.
     """
 
     noise: Callable[[EpisodeParams, Array], Noise]
     init: Callable[[Tables, Noise, Sensed], LoopState]
     plan: Callable[[Tables, Array, LoopState, Noise, Sensed], tuple[LoopState, TickLog]]
     act: Callable[[Tables, LoopState, Noise, Sensed], tuple[LoopState, Array]]
-    stats: Callable[[Tables, Array, LoopState, Window], TickStats]
+    stats: ReadWindow
 
 
 def build_closed_loop(
@@ -187,12 +187,7 @@ def build_closed_loop(
         torque = jnp.asarray(at.sign) * torque
         return state._replace(controller=next_state), torque.reshape(-1)[order]
 
-    read = build_read_window(base, observe, at, free=own.base == "free", dt=scene.sim_dt)
-
-    def stats(tables: Tables, origin: Array, state: LoopState, window: Window) -> TickStats:
-        wanted = state.controller.command[0], state.controller.velocity
-        return read(tables.params.robot, state.track, origin, window, *wanted)
-
+    stats = build_read_window(base, observe, at, free=own.base == "free", dt=scene.sim_dt)
     return ClosedLoop(noise=noise, init=init, plan=plan, act=act, stats=stats)
 
 

@@ -134,11 +134,11 @@ def empty_stats(ticks: int, robots: int, dtype: Any) -> TickStats:
     )
 
 
-def empty_window(model: mujoco.MjModel, robots: int, steps: int, dtype: Any) -> Window:
-    """Zeros for the windows of some robots, which are the leading axis."""
+def empty_windows(model: mujoco.MjModel, robots: int, ticks: int, steps: int, dtype: Any) -> Window:
+    """Zeros for the windows of some ticks, leading axes (robots, ticks)."""
 
     def zeros(rows: int, width: int) -> np.ndarray:
-        return np.zeros((robots, rows, width), dtype)
+        return np.zeros((robots, ticks, rows, width), dtype)
 
     return Window(
         qpos=zeros(steps + 1, model.nq),
@@ -152,6 +152,8 @@ def build_read_window(
     base: Base, observe: Observe, at: Addresses, *, free: bool, dt: float
 ) -> ReadWindow:
     """Function (params, track, origin, window, command, reference) -> stats of one tick.
+
+    ``command`` and ``reference`` are those of v_x in the tick [m/s].
 
     Args:
       base: that the robot walks on.

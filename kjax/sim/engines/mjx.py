@@ -309,7 +309,9 @@ class MjxEngine:
                 sensordata=states.sensordata,
                 torque=jnp.repeat(torques, unit, axis=0),
             )
-            stats = loop.stats(tables, params.origin, after.walk, window)
+            wanted = log.velocity_command, log.velocity_reference
+            track = after.walk.track
+            stats = loop.stats(tables.params.robot, track, params.origin, window, *wanted)
             return after, MjxTick(data.qpos, data.qvel, torques[0], log, stats)
 
         return jax.lax.scan(tick, state, None, length=_PIECE)

@@ -43,9 +43,10 @@ from kjax.sim.episode import (
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, empty_log, recording_of_ticks
 from kjax.sim.scene import build_model
-from kjax.sim.tick_stats import TickStats, empty_stats, empty_window
+from kjax.sim.tick_stats import TickStats, empty_stats, empty_windows
 
 _WAIT = 0.1  # s between two looks at the threads
+_READ = 10  # ticks whose physics steps are read in one call
 
 
 class Calls(NamedTuple):
@@ -55,7 +56,7 @@ class Calls(NamedTuple):
       init: (tables, params, sensed) -> state.
       first: (tables, params, state, step, sensed) -> (state, torque, log); plan and act.
       then: the same without plan -> (state, torque).
-      stats: (tables, params, state, window) -> stats of the tick.
+      stats: (robot, track, origin, windows, commands, references) -> stats of some ticks.
     """
 
     init: Callable[..., LoopState]
@@ -182,15 +183,16 @@ class BatchEngine:
             def then(tables: Any, params: Any, state: Any, step: Any, sensed: Any) -> Any:
                 return loop.act(tables, state, loop.noise(params, step), sensed)
 
-            def stats(tables: Any, params: Any, state: Any, window: Any) -> Any:
-                return loop.stats(tables, params.origin, state, window)
+            # All else is the same in every tick of an episode.
+            stats = jax.vmap(loop.stats, (None, None, None, 0, 0, 0))
+            robots = axes.params.robot
 
             self._calls[key] = Calls(
                 init=jax.jit(jax.vmap(init, (axes, 0, 0))),
                 # The old state is given up, so that what stays the same is not copied.
                 first=jax.jit(jax.vmap(first, (axes, 0, 0, None, 0)), donate_argnums=2),
                 then=jax.jit(jax.vmap(then, (axes, 0, 0, None, 0)), donate_argnums=2),
-                stats=jax.jit(jax.vmap(stats, (axes, 0, 0, 0))),
+                stats=jax.jit(jax.vmap(stats, (robots, 0, 0, 0, 0, 0))),
             )
         return self._calls[key]
 
@@ -238,7 +240,10 @@ class _Group:
         self._delay = params.delay // self._unit
         self.fell_at = np.full(count, self.ticks)
         self.fell = np.zeros(count, bool)
-        self._window = empty_window(model, count, self._per_tick, self._dtype)
+        # The physics steps of the last ticks, until they are read, and what was asked in each.
+        self._windows = empty_windows(model, count, _READ, self._per_tick, self._dtype)
+        self._asked = np.zeros((2, count, _READ), self._dtype)
+        self._kept = 0
         self._record: list[Any] = []
 
     def sensed(self) -> Sensed:
@@ -257,8 +262,7 @@ class _Group:
         state, *rest = self._calls.first(self._tables, self._params, state, step, sensed)
         if self._unit < self._per_tick:
             state, *rest = self._calls.then(self._tables, self._params, state, step, sensed)
-        stats = self._calls.stats(self._tables, self._params, state, self._window)
-        jax.block_until_ready((state, rest, stats))
+        jax.block_until_ready((state, rest, self._read(state)))
 
     def walk(self) -> None:
         """All ticks, until told to stop."""
@@ -291,17 +295,19 @@ class _Group:
                 ids = np.flatnonzero(alive)
                 if not len(ids):
                     break
+            self._asked[:, :, self._kept] = host.velocity_command, host.velocity_reference
             state = self._steps(state, torque, step, ids)
-            found = self._calls.stats(tables, params, state, self._window)
-            for array, value in zip(stats, found, strict=True):
-                array[tick] = value
+            self._kept += 1
             self.done = tick + 1
+            if self._kept == _READ:
+                self._read_into(stats, state)
+        self._read_into(stats, state)
         self._record = [*series, *stats]
 
     def _steps(
         self, state: LoopState, torque: np.ndarray, step: int, ids: np.ndarray | None
     ) -> LoopState:
-        """The physics steps of a tick, which are left in the window."""
+        """The physics steps of a tick, which are left in the windows."""
         for i in range(0, self._per_tick, self._unit):
             if i > 0:
                 state, later = self._calls.then(
@@ -314,6 +320,19 @@ class _Group:
                 self._advance(ids)
         self._note(self._per_tick)
         return state
+
+    def _read(self, state: LoopState) -> TickStats:
+        """Stats (robots, ticks) of the windows that are kept; further ones mean nothing."""
+        robot, origin = self._tables.params.robot, self._params.origin
+        return self._calls.stats(robot, state.track, origin, self._windows, *self._asked)
+
+    def _read_into(self, stats: TickStats, state: LoopState) -> None:
+        """Write the stats of the ticks that are kept, the last ones done, and keep none."""
+        if self._kept:
+            done = slice(self.done - self._kept, self.done)
+            for series, found in zip(stats, self._read(state), strict=True):
+                series[done] = np.moveaxis(np.asarray(found), 1, 0)[: self._kept]
+        self._kept = 0
 
     def _apply(self, torque: np.ndarray, step: int) -> None:
         """Torques, delayed, and pushes for the physics steps from ``step`` on."""
@@ -328,11 +347,11 @@ class _Group:
 
     def _note(self, place: int, torque: np.ndarray | None = None) -> None:
         """Keep the state before a step of the tick, or after its last, and the torque."""
-        window = self._window
-        window.qpos[:, place], window.qvel[:, place] = self._qpos, self._qvel
-        window.sensordata[:, place] = self._sensordata
+        windows, where = self._windows, (slice(None), self._kept, place)
+        windows.qpos[where], windows.qvel[where] = self._qpos, self._qvel
+        windows.sensordata[where] = self._sensordata
         if torque is not None:
-            window.torque[:, place] = torque
+            windows.torque[where] = torque
 
     def _advance(self, ids: np.ndarray | None) -> None:
         """A physics step of the robots that are alive."""
