@@ -194,7 +194,9 @@ def kkt_errors(
     Component by component, so neither the size of the cost nor the unit of any variable or row
     matters. What rounding of the largest terms leaves is none of these. For that, ``d`` are the
     expected sizes of the variables, 0 for those that are fixed, and ``units`` those of rows and box
-    for x = d. A multiplier at a side that does not exist counts as 0, and what holds a variable at
+    for x = d. Far out every row holds to within the rounding of its terms, and every slope is lost
+    in that of H x: there the sums of terms count, not the sizes, and nothing is rounding. A
+    multiplier at a side that does not exist counts as 0, and what holds a variable at
     its bound is the rest of its equation: the multipliers that come back are those judged; the
     values (m + n,) of rows and box follow.
     """
@@ -208,20 +210,23 @@ def kkt_errors(
     Hx, value, push = by_H.sum(1), by_C.sum(1), by_y.sum(0)
     inverse = jnp.where(d > 0, 1.0 / jnp.where(d > 0, d, 1.0), 0.0)
     reach = jnp.max(size_x * inverse)
+    far = is_far(reach)
 
-    noise = rounding * reach * units
+    noise = jnp.where(far, 0.0, rounding * reach * units)
     violated = jnp.maximum(low[:m] - value, value - high[:m])
     bound = jnp.where(violated > 0, jnp.where(low[:m] > value, low[:m], high[:m]), 0.0)
-    primal = _ratio(violated - noise[:m], jnp.abs(bound) + jnp.abs(by_C).sum(1))
+    row_terms = jnp.where(far, jnp.abs(value), jnp.abs(by_C).sum(1))
+    primal = _ratio(violated - noise[:m], jnp.abs(bound) + row_terms)
 
     rest = -(Hx + q + push)
     holds = jnp.where(rest > 0, x >= high[m:], x <= low[m:])
     y_box = jnp.where(holds, rest, y_box)
     y = jnp.concatenate([y_rows, y_box])
     r_dual = jnp.abs(y_box - rest)
-    rounded_terms = jnp.abs(by_H).sum(1) + jnp.abs(q)
+    rounded_terms = jnp.where(far, jnp.abs(Hx), jnp.abs(by_H).sum(1)) + jnp.abs(q)
     y_terms = jnp.abs(by_y).sum(0) + jnp.abs(y_box)
     hidden = rounding * jnp.maximum(rounded_terms, jnp.max(rounded_terms * d) * inverse)
+    hidden = jnp.where(far, 0.0, hidden)
     dual = _ratio(r_dual - hidden - rounding * y_terms, rounded_terms + y_terms)
 
     side = jnp.where(y > 0, high, low)
@@ -247,6 +252,11 @@ def kkt_errors(
     return error, y, jnp.concatenate([value, x])
 
 
+def is_far(reach: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a point lies so far out, in its expected sizes, that rounding may make it right."""
+    return reach > float(jnp.finfo(reach.dtype).eps) ** -0.5
+
+
 def contradicts(scaling: RowScaling, data: RowData, tolerance: float) -> Bool[Array, ""]:
     """Whether a row that no free variable can move breaks its bound."""
     C, m = data.C, data.C.shape[0]
@@ -269,9 +279,12 @@ def rows_error(
     rounding = 4.0 * n**0.5 * float(jnp.finfo(x.dtype).eps)
     size_C, value = jnp.abs(C), C @ x
     violated = jnp.maximum(low - value, value - high)
-    noise = rounding * jnp.max(jnp.abs(x) / d) * (size_C @ d)
+    reach = jnp.max(jnp.abs(x) / d)
+    far = is_far(reach)
+    noise = jnp.where(far, 0.0, rounding * reach * (size_C @ d))
     bound = jnp.where(violated > 0, jnp.where(low > value, low, high), 0.0)
-    return jnp.max(_ratio(violated - noise, jnp.abs(bound) + size_C @ jnp.abs(x)), initial=0.0)
+    terms = jnp.abs(bound) + jnp.where(far, jnp.abs(value), size_C @ jnp.abs(x))
+    return jnp.max(_ratio(violated - noise, terms), initial=0.0)
 
 
 def _ratio(part: Array, whole: Array) -> Array:

@@ -275,3 +275,32 @@ def test_the_unit_of_a_row_changes_nothing_however_small_or_large(unit, method):
     )  # fmt: skip
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, 0.5, atol=1e-4 if dtype == "float32" else 1e-8)
+
+
+# Drawn by the benchmark's count (seed 0): tiny curvature lets the point go 1e8 to 1e12 units out,
+# where rounding of a row's terms is larger than the gap that no point can close.
+FAR_OUT = {
+    "two rows, 16 (x + y) >= -43.84 and -0.5 (x + y) >= 1.37": (
+        [[1.9367797832215135e-16, -7.903028851346405e-17],
+         [-7.903028851346405e-17, 3.2280532500320025e-17]],
+        [2.3500162132473736e-06, 2.121842276426989e-06],
+        [[16.0, 16.0], [-0.5, -0.5], [-0.6958901335311157, 1.173704779870729]],
+        [-43.83697582168227, 1.371117618958628, -INF], [-18.01453742130406, INF, INF],
+        [-INF, -1.1259085888315035], [1.3463596309232722, INF],
+    ),
+    "y >= 0.6355 and y <= 0.6314": (
+        [[4.907156460623877e-19, -1.2929016645859098e-18],
+         [-1.2929016645859098e-18, 3.4098921619866742e-18]],
+        [-4.4764733980653745e-06, -1.9444513427045178e-05],
+        [[0.0, 0.14283469156314038], [0.0, 0.42850407468942114], [0.0, -1.142677532505123]],
+        [0.09077373293688046, 0.2723211988106414, -0.7214949485224169],
+        [0.24965273485070077, INF, INF],
+        [0.304637544981851, -INF], [INF, 0.6355160076552813],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FAR_OUT)
+def test_a_point_far_out_does_not_hide_a_contradiction_in_its_rounding(case, semidefinite_method):
+    found = solve(*map(np.array, FAR_OUT[case]), method=semidefinite_method)
+    assert Status(int(found.status)) == Status.INFEASIBLE
