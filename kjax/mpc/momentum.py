@@ -1,0 +1,315 @@
+"""LMPC in three dimensions on the momentum form of the rigid body, over a horizon of nodes.
+
+About a path (p_b, v_b, a_b) the momentum ``Lam = L + m (p - p_b) x (v - v_b)`` is exactly linear in
+the forces, as (1, p, v, H) is about a fixed point (``koopman.momentum``):
+
+    Lam' = sum (r_i - p_b) x F_i + m (p - p_b) x (g - a_b),   m (g - a_b) = -sum F_b
+
+The attitude alone is linearised: R = exp(d) R_b, d' = W_b (Lam - L_b + L_b x d), with W_b the
+inverse of the inertia I_w(R_b). The path is the roll-out of nominal forces F_b from the present
+state: those of the last plan. So the QP is in the changes u = F - F_b, and the prediction is that
+of x = (d, p - p_b, Lam - L_b, v - v_b):
+
+    x_{k+1} = A_k x_k + sum over the standing feet of B_kf u_kf,   x_0 = 0
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from kjax import qp
+from kjax.dynamics import rotations, srb_spatial
+from kjax.dynamics.rotations import skew
+from kjax.dynamics.srb_spatial import BodyState, Contacts, SpatialBody
+from kjax.mpc.grid import FootNodes, Grid
+
+STATE = 12  # numbers of x, and of the errors that the cost weighs
+
+
+class Targets(NamedTuple):
+    """What the body shall do at the nodes' ends.
+
+    Attributes:
+      R: (K, 3, 3) attitude, trunk to world [-].
+      p: (K, 3) centre of mass [m].
+      omega: (K, 3) angular velocity, world [rad/s].
+      v: (K, 3) velocity [m/s].
+      heading: (K, 2) cosine and sine of the heading that weights are given in [-].
+      force: (K, 4, 3) force of each leg that costs nothing [N].
+    """
+
+    R: Float[Array, "K 3 3"]
+    p: Float[Array, "K 3"]
+    omega: Float[Array, "K 3"]
+    v: Float[Array, "K 3"]
+    heading: Float[Array, "K 2"]
+    force: Float[Array, "K 4 3"]
+
+
+class Weights(NamedTuple):
+    """Weights per second of the horizon; axes of the heading: ahead, left, up.
+
+    Attributes:
+      attitude: (3,) about these axes [1/(rad^2 s)].
+      position: (3,) [1/(m^2 s)].
+      omega: (3,) [s/rad^2].
+      velocity: (3,) [s/m^2].
+      force: of every force's change from its target [1/(N^2 s)].
+    """
+
+    attitude: Float[Array, "3"]
+    position: Float[Array, "3"]
+    omega: Float[Array, "3"]
+    velocity: Float[Array, "3"]
+    force: Float[Array, ""]
+
+
+class Limits(NamedTuple):
+    """What a foot may press.
+
+    Attributes:
+      friction: mu of the pyramid [-].
+      force_z: (2,) bounds of F_z [N].
+    """
+
+    friction: Float[Array, ""]
+    force_z: Float[Array, "2"]
+
+
+class Response(NamedTuple):
+    """Prediction about the nominal roll-out.
+
+    Attributes:
+      states: nominal ones (K + 1, ...), the first one now.
+      A: (K, 12, 12).
+      B: (K, 4, 12, 3) of each leg.
+    """
+
+    states: BodyState
+    A: Float[Array, "K 12 12"]
+    B: Float[Array, "K 4 12 3"]
+
+
+class MomentumPlan(NamedTuple):
+    """Result of ``solve``.
+
+    Attributes:
+      force: (K, 4, 3) force of each leg in each node, world [N].
+      states: (K + 1, ...) nominal states.
+      status: a ``qp.Status``.
+      residual: largest of primal and dual residual and gap [-].
+      iterations: of the solver.
+    """
+
+    force: Float[Array, "K 4 3"]
+    states: BodyState
+    status: Int[Array, ""]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+
+
+def linearise(
+    body: SpatialBody,
+    start: BodyState,
+    length: Float[Array, "K"],
+    feet: Float[Array, "K 4 3"],
+    nominal: Float[Array, "K 4 3"],
+) -> Response:
+    """Roll out nominal forces, and the response to changes of them.
+
+    Args:
+      body: mass and inertia.
+      start: now.
+      length: of the nodes [s].
+      feet: contact points of each leg in each node, world [m].
+      nominal: force of each leg in each node, 0 in the air, world [N].
+    """
+    states = srb_spatial.rollout(body, start, Contacts(feet, nominal), length)
+    now, then = (
+        jax.tree.map(lambda a, s=s: a[s], states) for s in (slice(None, -1), slice(1, None))
+    )
+    pieces = jax.vmap(_node, (None, 0, 0, 0, 0, 0))(body, now, then, length, feet, nominal)
+    return Response(states, *pieces)
+
+
+def _node(
+    body: SpatialBody,
+    now: BodyState,
+    then: BodyState,
+    h: Float[Array, ""],
+    feet: Float[Array, "4 3"],
+    nominal: Float[Array, "4 3"],
+) -> tuple[Float[Array, "12 12"], Float[Array, "4 12 3"]]:
+    """A and B of one node: exact but for d, which is by the implicit midpoint rule."""
+    m, total = body.mass, nominal.sum(axis=0)
+    eye, zero = jnp.eye(3, dtype=h.dtype), jnp.zeros((3, 3), h.dtype)
+    a = srb_spatial.gravity(h.dtype) + total / m
+    mean = now.p + h / 2 * now.v + h**2 / 6 * a  # of the path over the node
+    pull = h * skew(total)
+    turn = rotations.exp(h / 2 * srb_spatial.angular_velocity(body, now.R, now.L)) @ now.R
+    W = turn @ jnp.linalg.solve(body.inertia, turn.T)
+    half = h / 2 * W @ skew((now.L + then.L) / 2)
+    back = jnp.linalg.inv(eye - half)
+    by_L = h / 2 * back @ W  # of d by the sum of Lam before and after
+
+    # Rows: d, p, Lam, v. d sees the mean of Lam before and after the node.
+    L_row = jnp.concatenate([zero, pull, eye, h / 2 * pull], axis=1)
+    L_now = jnp.concatenate([zero, zero, eye, zero], axis=1)
+    d_row = jnp.concatenate([back @ (eye + half), zero, zero, zero], axis=1)
+    d_row = d_row + by_L @ (L_row + L_now)
+    A = jnp.concatenate(
+        [
+            d_row,
+            jnp.concatenate([zero, eye, zero, h * eye], axis=1),
+            L_row,
+            jnp.concatenate([zero, zero, zero, eye], axis=1),
+        ]
+    )
+    L_by_foot = h * skew(feet - mean[None]) + (h**2 / (6 * m) * pull)[None]
+    place = jnp.broadcast_to(h**2 / (2 * m) * eye, (4, 3, 3))
+    speed = jnp.broadcast_to(h / m * eye, (4, 3, 3))
+    B = jnp.concatenate([by_L[None] @ L_by_foot, place, L_by_foot, speed], axis=1)
+    return A, B
+
+
+def errors(
+    body: SpatialBody, states: BodyState, targets: Targets
+) -> tuple[Float[Array, "K 12"], Float[Array, "K 12 12"]]:
+    """Errors of the nominal states (attitude, position, omega, velocity), and how x changes them.
+
+    In the axes of the targets' heading.
+
+    Args:
+      body: inertia.
+      states: nominal, at the nodes' ends (K, ...).
+      targets: there.
+    """
+
+    def one(state: BodyState, target: Targets) -> tuple[Array, Array]:
+        eye, zero = jnp.eye(3, dtype=state.p.dtype), jnp.zeros((3, 3), state.p.dtype)
+        e = rotations.log(state.R @ target.R.T)
+        K = skew(e)
+        W = state.R @ jnp.linalg.solve(body.inertia, state.R.T)
+        omega = W @ state.L
+        error = [e, state.p - target.p, omega - target.omega, state.v - target.v]
+        rows = [
+            [eye - K / 2 + K @ K / 12, zero, zero, zero],
+            [zero, eye, zero, zero],
+            [W @ skew(state.L) - skew(omega), zero, W, zero],
+            [zero, zero, zero, eye],
+        ]
+        c, s = target.heading
+        o = jnp.zeros_like(c)
+        to_heading = jnp.stack(
+            [jnp.stack([c, s, o]), jnp.stack([-s, c, o]), jnp.stack([o, o, o + 1])]
+        )
+        C = jnp.concatenate(
+            [jnp.concatenate([to_heading @ b for b in row], axis=1) for row in rows]
+        )
+        return jnp.concatenate([to_heading @ part for part in error]), C
+
+    return jax.vmap(one)(states, targets)
+
+
+def solve(
+    body: SpatialBody,
+    start: BodyState,
+    grid: Grid,
+    feet: Float[Array, "K 4 3"],
+    nominal: Float[Array, "K 4 3"],
+    targets: Targets,
+    weights: Weights,
+    limits: Limits,
+    listed: FootNodes,
+    *,
+    tolerance: float = 1e-6,
+    max_iterations: int = 200,
+) -> MomentumPlan:
+    """Forces over the horizon. Eleven arguments: the problem's data, each of another origin.
+
+    Args:
+      body: mass and inertia.
+      start: now.
+      grid: nodes.
+      feet: contact points of each leg in each node, world [m].
+      nominal: forces that the prediction is made about, 0 in the air, world [N].
+      targets: at the nodes' ends.
+      weights: of their errors.
+      limits: of the forces.
+      listed: feet that press.
+      tolerance: at which the QP counts as solved [-].
+      max_iterations: of the QP.
+    """
+    response = linearise(body, start, grid.length, feet, nominal)
+    ends = jax.tree.map(lambda a: a[1:], response.states)
+    error, C = errors(body, ends, targets)
+    G = _condensed(response, listed)  # (K, 12, 3F)
+    Y = C @ G
+    weight = jnp.concatenate([weights.attitude, weights.position, weights.omega, weights.velocity])
+    weight = grid.length[:, None] * weight[None]
+    n = Y.shape[-1]
+    weighted = (Y * weight[..., None]).reshape(-1, n)
+    used = jnp.repeat(listed.used, 3)
+    cost = jnp.where(used, jnp.repeat(weights.force * grid.length[listed.node], 3), 1.0)
+    where = (listed.node, listed.leg)
+    base = nominal[where]
+    H = 2.0 * (weighted.T @ Y.reshape(-1, n) + jnp.diag(cost))
+    away = jnp.where(used, (base - targets.force[where]).reshape(-1), 0.0)
+    q = 2.0 * (weighted.T @ error.reshape(-1) + cost * away)
+
+    rows, low_row, high_row, low, high = _limit_rows(limits, listed, base)
+    solution = qp.solve_rows(
+        H, q, rows, low_row, high_row, low, high,
+        method="active_set", tolerance=tolerance, max_iterations=max_iterations,
+    )  # fmt: skip
+    change = jnp.where(used, solution.x, 0.0).reshape(-1, 3)
+    force = nominal.at[where].add(change)
+    return MomentumPlan(
+        force=force,
+        states=response.states,
+        status=solution.status,
+        residual=jnp.maximum(jnp.maximum(solution.primal, solution.dual), solution.gap),
+        iterations=solution.iterations,
+    )
+
+
+def _condensed(response: Response, listed: FootNodes) -> Float[Array, "K 12 forces"]:
+    """How x at each node's end depends on the changes of the listed forces."""
+    own = response.B[listed.node, listed.leg] * listed.used[:, None, None]  # (F, 12, 3)
+    own = jnp.moveaxis(own, 0, 1)
+
+    def one(G: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        A, k = now
+        here = jnp.where((listed.node == k)[None, :, None], own, 0.0)
+        G = jnp.einsum("ij,jfc->ifc", A, G) + here
+        return G, G
+
+    K = response.A.shape[0]
+    _, G = jax.lax.scan(one, jnp.zeros_like(own), (response.A, jnp.arange(K)))
+    return G.reshape(K, STATE, -1)
+
+
+def _limit_rows(
+    limits: Limits, listed: FootNodes, base: Float[Array, "F 3"]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Rows of the friction pyramids with bounds, and the box, of the changes of the forces."""
+    F, mu = base.shape[0], limits.friction
+    one, zero = jnp.ones_like(mu), jnp.zeros_like(mu)
+    pyramid = jnp.stack(
+        [
+            jnp.stack([one, zero, -mu]),
+            jnp.stack([-one, zero, -mu]),
+            jnp.stack([zero, one, -mu]),
+            jnp.stack([zero, -one, -mu]),
+        ]
+    )
+    eye = jnp.eye(F, dtype=base.dtype)
+    rows = jnp.einsum("rc,fg->frgc", pyramid, eye).reshape(4 * F, 3 * F)
+    high_row = jnp.where(listed.used[:, None], -(base @ pyramid.T), 0.0).reshape(-1)
+    side = mu * limits.force_z[1]
+    high = jnp.stack([side, side, limits.force_z[1]])[None] - base
+    low = jnp.stack([-side, -side, limits.force_z[0]])[None] - base
+    low, high = (jnp.where(listed.used[:, None], a, 0.0).reshape(-1) for a in (low, high))
+    return rows, jnp.full_like(high_row, -jnp.inf), high_row, low, high
