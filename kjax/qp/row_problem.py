@@ -136,7 +136,17 @@ def scale_rows(data: RowData, *, equilibrate: bool = True) -> tuple[RowProblem, 
 
     h = jnp.max(jnp.where(free, jnp.diagonal(H) * d**2, 0.0), initial=0.0)
     slope = jnp.max(jnp.abs(linear))
-    sigma = _expected_size(slope, h, low_hat, high_hat, off, m)
+    lonely = free & ~H.any(axis=0) & ~C_free.any(axis=0)
+    apart = jnp.concatenate([immovable, fixed | lonely])
+    sigma = _expected_size(slope, h, low_hat, high_hat, apart, m)
+    # A variable that no row and no other variable meets is as large as its own box.
+    sides = jnp.abs(jnp.stack([low[m:], high[m:]]))
+    box = jnp.max(jnp.where(jnp.isfinite(sides), sides, 0.0), axis=0)
+    own_unit = jnp.where(lonely & (box > 0), box / (d * sigma), 1.0)
+    d, linear = d * own_unit, linear * own_unit
+    slope = jnp.max(jnp.abs(linear))
+    unit_of_row = jnp.concatenate([length, d])
+    low_hat, high_hat = (low - shift) / unit_of_row, (high - shift) / unit_of_row
     cost = jnp.maximum(h * sigma, slope)
     cost = jnp.where(cost > 0, cost, 1.0)
     own = jnp.where(h > 0, h, 1.0) * (sigma / cost)  # diagonal of a fixed variable

@@ -304,3 +304,21 @@ FAR_OUT = {
 def test_a_point_far_out_does_not_hide_a_contradiction_in_its_rounding(case, semidefinite_method):
     found = solve(*map(np.array, FAR_OUT[case]), method=semidefinite_method)
     assert Status(int(found.status)) == Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e6, 1e12])
+def test_a_variable_that_nothing_meets_does_not_loosen_the_rows_of_others(
+    unit, semidefinite_method
+):
+    """The judge forgives what rounding leaves of the largest terms: not those of others."""
+    C, q = np.array([[-95.954426622771, 0.0]]), np.array([-4.502643100293e9, 0.0])
+    low, high = np.array([0.098066975892]), np.array([2.095546898996])
+    lower, upper = np.array([-1.02e-3, -unit]), np.array([6.675e-2, 5.0 * unit])
+    problem = np.zeros((2, 2)), q, C, low, high, lower, upper
+    found = solve(*problem, method=semidefinite_method)
+    assert Status(int(found.status)) == Status.INFEASIBLE  # it needs x <= -1.022e-3
+    lower[0] = -1.022016173130e-03
+    found = solve(*problem, method=semidefinite_method)
+    assert Status(int(found.status)) == Status.SOLVED
+    x = float(found.x[0])
+    assert C[0, 0] * x >= low[0] * (1 - 2.2e-9)
