@@ -68,6 +68,23 @@ class CycleSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SpatialSpec:
+    """The LMPC in three dimensions, on the momentum form of the rigid body.
+
+    Attributes:
+      nodes: largest number of nodes of the horizon.
+      feet: largest number of feet that press, over all nodes.
+      tolerance: relative residuals and gap at which the QP counts as solved [-].
+      max_iterations: limit of the QP.
+    """
+
+    nodes: int
+    feet: int
+    tolerance: float = 1e-6
+    max_iterations: int = 200
+
+
+@dataclass(frozen=True, kw_only=True)
 class ControllerSpec:
     """Static choices of a controller.
 
@@ -86,6 +103,7 @@ class ControllerSpec:
       tolerance: relative KKT residual at which a QP counts as solved [-].
       max_iterations: limit of the QP.
       cycle: horizon through flight; ``None`` where no gait has one.
+      spatial: the LMPC in three dimensions; ``None`` for the planar one.
       gaits: number of phases of each gait, and of its levels of a ramp.
       modes: contact mode of each problem within a stance; see ``ControllerParams.problem``.
     """
@@ -104,5 +122,6 @@ class ControllerSpec:
     tolerance: float = 1e-9
     max_iterations: int = 2000
     cycle: CycleSpec | None = None
+    spatial: SpatialSpec | None = None
     gaits: tuple[tuple[int, int], ...] = ()
     modes: tuple[int, ...] = ()

@@ -84,7 +84,8 @@ class RobotParams(NamedTuple):
 
     Attributes:
       mass: total mass [kg].
-      pitch_inertia: of the whole robot about its centre of mass, nominal stance [kg m^2].
+      inertia: (3, 3) of the whole robot about its centre of mass, nominal stance, trunk axes
+        [kg m^2].
       trunk_mass: mass of the trunk link [kg].
       trunk_com: its centre of mass, trunk frame [m].
       link_mass: mass of hip, thigh and calf link [kg].
@@ -102,7 +103,7 @@ class RobotParams(NamedTuple):
     """
 
     mass: Float[Array, ""]
-    pitch_inertia: Float[Array, ""]
+    inertia: Float[Array, "3 3"]
     trunk_mass: Float[Array, ""]
     trunk_com: Float[Array, "3"]
     link_mass: Float[Array, "3"]
@@ -116,6 +117,11 @@ class RobotParams(NamedTuple):
     joint_range: Float[Array, "3 2"]
     link_inertia: Float[Array, "2"]
     stand_height: Float[Array, ""]
+
+    @property
+    def pitch_inertia(self) -> Float[Array, ""]:
+        """About the axis to the left [kg m^2]."""
+        return self.inertia[..., 1, 1]
 
 
 COMMAND_NAMES = ("v_x", "v_y", "yaw_rate", "height", "roll", "pitch")

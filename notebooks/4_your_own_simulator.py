@@ -105,18 +105,19 @@ def stand(height):
     mujoco.mj_forward(model, data)
 
 
-def pitch_inertia():
-    """Of all links about the common centre of mass [kg m^2]."""
+def inertia():
+    """Of all links about the common centre of mass, trunk axes (3, 3) [kg m^2]."""
     arms = data.xipos - data.subtree_com[0]
     axes = data.ximat.reshape(-1, 3, 3)
-    turned = np.einsum("bij,bj->bi", axes**2, model.body_inertia)  # diagonal, world axes
-    return float((turned[:, 1] + model.body_mass * (arms[:, 0] ** 2 + arms[:, 2] ** 2)).sum())
+    own = np.einsum("bij,bj,bkj->ik", axes, model.body_inertia, axes)
+    square = (model.body_mass * (arms**2).sum(axis=1)).sum() * np.eye(3)
+    return own + square - np.einsum("b,bi,bj->ij", model.body_mass, arms, arms)
 
 
 stand(HEIGHT)
 params = RobotParams(
     mass=np.float64(model.body_mass.sum()),
-    pitch_inertia=np.float64(pitch_inertia()),
+    inertia=inertia(),
     trunk_mass=np.float64(TRUNK),
     trunk_com=np.zeros(3),
     link_mass=np.array([HIP, THIGH, CALF]),

@@ -11,6 +11,7 @@ from kjax.config.control import (
     LegConfig,
     LmpcConfig,
     MultiPhaseConfig,
+    SpatialConfig,
 )
 from kjax.config.gaits import GaitConfig, Gaits
 from kjax.config.loading import ConfigError, Overlay, fields, load_config, to_dict, tunable
@@ -40,6 +41,7 @@ __all__ = [
     "PushConfig",
     "RunConfig",
     "SimConfig",
+    "SpatialConfig",
     "SrbConfig",
     "SweepConfig",
     "TerrainConfig",

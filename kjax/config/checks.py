@@ -60,6 +60,9 @@ STATE_COST = Unit(
     text="1 / (L^2, L^2, rad^2, g L, g L, g / L)",
     powers=((0, -2, 0), (0, -2, 0), (0, 0, 0), (0, -2, 2), (0, -2, 2), (0, 0, 2)),
 )
+POSITION_COST = Unit(text="1 / L^2", powers=((0, -2, 0),) * 3)
+OMEGA_COST = Unit(text="L / g", powers=((0, 0, 2),) * 3)
+VELOCITY_COST = Unit(text="1 / (g L)", powers=((0, -2, 2),) * 3)
 INPUT_COST = Unit(text="1 / (m g)^2", powers=((-2, 0, 0),))
 WRENCH_COST = Unit(
     text="1 for forces and 1 / L^2 for moments", powers=((0, 0, 0),) * 3 + ((0, -2, 0),) * 3

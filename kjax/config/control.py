@@ -18,11 +18,14 @@ from kjax.config.checks import (
     LENGTH,
     LINEAR_DAMPING,
     MIN_GRF,
+    OMEGA_COST,
+    POSITION_COST,
     RATE,
     STATE_COST,
     STIFFNESS,
     STRICT,
     TIME,
+    VELOCITY_COST,
     WRENCH_COST,
     Bound,
     Count,
@@ -169,6 +172,49 @@ class MultiPhaseConfig:
     tolerance: Positive = 1e-6
     """Relative residuals and gap at which the QP counts as solved [-]."""
     max_iterations: Count = 30
+    """Iteration limit of the QP [-]."""
+
+
+Three = tuple[NonNegative, NonNegative, NonNegative]
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SpatialConfig:
+    """LMPC in three dimensions, for controller = "spatial".
+
+    Weights are per second of the horizon, of errors ahead, to the left and up.
+    """
+
+    horizon: Positive = 0.25
+    """Length of the prediction, at most a gait cycle [s]."""
+    node_dt: Positive = 0.025
+    """Longest node where two feet stand, longer in proportion where more do [s]."""
+    attitude: Annotated[Three, COST] = (25.0, 25.0, 15.0)
+    """Weights of the squared errors of roll, pitch and yaw [1/rad^2]."""
+    position: Annotated[Three, COST, POSITION_COST] = (0.907, 0.907, 9.07)
+    """Of the centre of mass's place [1/L^2]."""
+    omega: Annotated[Three, COST, OMEGA_COST] = (2.303, 2.303, 2.303)
+    """Of the angular velocity [L/g]."""
+    velocity: Annotated[Three, COST, VELOCITY_COST] = (4.179, 4.179, 2.09)
+    """Of the centre of mass's velocity [1/(g L)]."""
+    force: Annotated[Positive, COST, INPUT_COST] = 0.0781
+    """Weight of every squared force's distance from the gait's mean force [1/(m g)^2]."""
+    friction: Annotated[float, Field(ge=0.05)] = 0.6
+    """mu of the pyramids |F_x|, |F_y| <= mu F_z; below the ground's, for margin [-]."""
+    grf_z_min: Annotated[Bound, MIN_GRF, FORCE] = 0.04
+    """Lower bound of F_z per leg [m g]."""
+    grf_z_max: Annotated[Bound, GRF, FORCE] = 2.0
+    """Upper bound of F_z per leg [m g]."""
+    yaw_slew: Positive = 8.0
+    """Largest rate at which the reference yaw rate follows the command [rad/s^2]."""
+    heading_slack: Positive = 0.3
+    """Largest lead or lag of the heading's reference before the trunk [rad]."""
+    velocity_time: Annotated[Positive, TIME] = 0.15
+    """Time in which the velocity is predicted to reach its reference, for the next footholds
+    [s]."""
+    tolerance: Positive = 1e-6
+    """Relative residuals and gap at which the QP counts as solved [-]."""
+    max_iterations: Count = 200
     """Iteration limit of the QP [-]."""
 
 

@@ -1,5 +1,7 @@
 """Whole configurations: a closed-loop run, the fit study."""
 
+from typing import Literal
+
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
@@ -11,6 +13,7 @@ from kjax.config.control import (
     LegConfig,
     LmpcConfig,
     MultiPhaseConfig,
+    SpatialConfig,
 )
 from kjax.config.gaits import Gaits, gait_setting
 from kjax.config.model import KoopmanConfig, SrbConfig
@@ -41,6 +44,11 @@ class RunConfig:
     """The gaits."""
     multiphase: MultiPhaseConfig = MultiPhaseConfig()
     """Horizon through flight."""
+    controller: Literal["planar", "spatial"] = "planar"
+    """Predict in the sagittal plane, with a regulator for the rest on a free base, or in three
+    dimensions [-]."""
+    spatial: SpatialConfig = SpatialConfig()
+    """LMPC in three dimensions."""
     leg: LegConfig = LegConfig()
     """Swing legs."""
     lateral: LateralConfig = LateralConfig()
@@ -67,6 +75,8 @@ class RunConfig:
         lateral = self.push.lateral
         if self.sim.base == "planar" and any(lateral if isinstance(lateral, tuple) else [lateral]):
             raise ValueError(f"push.lateral needs sim.base = 'free', got {lateral} and 'planar'")
+        if self.controller == "spatial" and self.sim.base == "planar":
+            raise ValueError("controller = 'spatial' needs sim.base = 'free', got 'planar'")
         if self.duration < self.lmpc.control_dt:
             raise ValueError(
                 f"duration is {self.duration} s, shorter than lmpc.control_dt "

@@ -134,7 +134,7 @@ def _foot_targets(
     footing = Footing(
         remaining=jnp.maximum(swings.duration - swings.elapsed, 0.0),
         stance_time=params.schedule.stance_time[state.clock.gait, state.clock.phase],
-        velocity=state.velocity + state.correction[0],
+        velocity=state.velocity.at[0].add(state.correction[0]),
         ground=state.ground,
     )
     target = base.foothold(robot, *settings, view, footing)

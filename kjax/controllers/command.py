@@ -1,4 +1,4 @@
-"""What of a command the planar controller follows; the rest is refused, or told while it runs."""
+"""What of a command a controller follows; the rest is refused, or told while it runs."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,16 +7,17 @@ import numpy as np
 from kjax.types import COMMAND_NAMES
 
 FOLLOWED = ("v_x", "height")
-V_X, HEIGHT = map(COMMAND_NAMES.index, FOLLOWED)
+V_X, V_Y, YAW_RATE, HEIGHT, ROLL, PITCH = range(len(COMMAND_NAMES))
 # Columns that have no effect.
 IGNORED = np.array([name not in FOLLOWED for name in COMMAND_NAMES])
 
 
-def check_command(columns: Mapping[str, Sequence[float]]) -> None:
-    """Refuse a command that the planar controller does not follow.
+def check_command(columns: Mapping[str, Sequence[float]], *, planar: bool) -> None:
+    """Refuse a command that a controller does not follow.
 
     Args:
       columns: values by name of the column.
+      planar: whether it is the planar controller; the spatial one follows all columns.
 
     Raises:
       ValueError: naming the column, for a value that is not finite, and for one other than 0 where
@@ -25,8 +26,8 @@ def check_command(columns: Mapping[str, Sequence[float]]) -> None:
     for name, values in columns.items():
         if not np.isfinite(values).all():
             raise ValueError(f"command.{name}: got {list(values)}, wanted finite values")
-        if name not in FOLLOWED and np.any(values):
+        if planar and name not in FOLLOWED and np.any(values):
             raise ValueError(
                 f"command.{name}: got {list(values)}, but the planar controller follows "
-                f"{' and '.join(FOLLOWED)} only; leave it at 0"
+                f"{' and '.join(FOLLOWED)} only; leave it at 0, or set controller = 'spatial'"
             )

@@ -95,7 +95,8 @@ class ControlLoop:
             in a column that this controller does not follow.
         """
         command = self._params.command.hold(**columns)
-        check_command({name: (value,) for name, value in columns.items()})
+        given = {name: (value,) for name, value in columns.items()}
+        check_command(given, planar=self._spec.spatial is None)
         self._params = self._params._replace(command=command)
         self._tables = with_params(self._tables, command=command)
 

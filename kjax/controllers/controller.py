@@ -18,20 +18,22 @@ from kjax import gait, qp
 from kjax.concrete import is_concrete
 from kjax.controllers.acting import build_act, facing
 from kjax.controllers.command import IGNORED
+from kjax.controllers.contacts import mean_height, next_swings
 from kjax.controllers.observation import (
     cast,
     check_observation,
     is_valid,
     or_neutral,
 )
-from kjax.controllers.params import ControllerParams, Tables
+from kjax.controllers.params import Tables
 from kjax.controllers.planning import ForceTask, Planner, build_planner
 from kjax.controllers.reference import next_clock, next_reference
+from kjax.controllers.spatial import PlanFrom, build_spatial_plan, start_spatial
 from kjax.controllers.state import ControllerState, PlanInfo
 from kjax.legs import contact, swing
 from kjax.legs.base import Base, View, build_base, to_local
 from kjax.legs.kinematics import PlanarState
-from kjax.mpc.lmpc import start_memory
+from kjax.mpc.lmpc import LmpcMemory, start_memory
 from kjax.precision import full_precision
 from kjax.spec import ControllerSpec
 from kjax.types import COMMAND_NAMES, JointCommand, Observation
@@ -83,8 +85,8 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
     """
     if not isinstance(spec, ControllerSpec):
         raise TypeError(f"spec: wanted that of kjax.resolve, got {type(spec).__name__}")
-    base = build_base(spec.base)
-    plan_forces = build_planner(spec) if planner is None else planner
+    base = build_base(spec.base, spatial_forces=spec.spatial is not None)
+    plan_from = _planar_plan(spec, planner) if spec.spatial is None else build_spatial_plan(spec)
     act = build_act(base, spec.act_dt)
 
     def init(tables: Tables, observation: Observation) -> ControllerState:
@@ -100,11 +102,6 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         tables: Tables, state: ControllerState, observation: Observation
     ) -> tuple[ControllerState, PlanInfo]:
         return _plan(base, plan_from, tables, state, observation)
-
-    def plan_from(
-        tables: Tables, state: ControllerState, view: View, flags: Array, valid: Array
-    ) -> tuple[ControllerState, PlanInfo]:
-        return _plan_from(spec, plan_forces, tables, state, view, flags, valid)
 
     def step(
         tables: Tables, state: ControllerState, observation: Observation
@@ -123,6 +120,17 @@ def build_controller(spec: ControllerSpec, planner: Planner | None = None) -> Co
         control_dt=spec.control_dt,
         act_dt=spec.act_dt,
     )
+
+
+def _planar_plan(spec: ControllerSpec, planner: Planner | None) -> PlanFrom:
+    plan_forces = build_planner(spec) if planner is None else planner
+
+    def plan_from(
+        tables: Tables, state: ControllerState, view: View, flags: Array, valid: Array
+    ) -> tuple[ControllerState, PlanInfo]:
+        return _plan_from(spec, plan_forces, tables, state, view, flags, valid)
+
+    return plan_from
 
 
 def _init(
@@ -161,13 +169,18 @@ def _init_from(
         time=zero,
         clock=gait.start(params.gaits[0], zero - spec.control_dt),  # first plan: phase 0
         stance=jnp.ones((4,), bool),
-        lag=zero,
+        lag=jnp.zeros((2,), zero.dtype),
+        heading=zero,
         command=jnp.zeros((len(COMMAND_NAMES),), zero.dtype),
         height=zero,
         ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
-        velocity=zero,
+        velocity=jnp.zeros((3,), zero.dtype),
         correction=jnp.zeros((2,), zero.dtype),
-        memory=start_memory(tables.lmpc, spec),
+        memory=(
+            start_memory(tables.lmpc, spec)
+            if spec.spatial is None
+            else start_spatial(spec.spatial, zero.dtype)
+        ),
         force=jnp.zeros((4, 3), zero.dtype),
         swing=swing.initial_swing(view.feet),
         feet=view.feet,
@@ -210,14 +223,15 @@ def _plan_from(
     valid: Array,
 ) -> tuple[ControllerState, PlanInfo]:
     """``Controller.plan_from``: clock, swing legs, ground, reference, forces."""
+    assert isinstance(state.memory, LmpcMemory)
     params, control_dt = tables.params, spec.control_dt
     clock = next_clock(params, state, control_dt)
     where = (clock.gait, clock.phase)
     stance, mode = params.schedule.stance[where], params.schedule.mode[where]
     feet = jnp.where(valid, view.feet, state.feet)
-    swings = _next_swings(params, state, clock, stance, flags, feet)
+    swings = next_swings(params, state, clock, stance, flags, feet)
     heights = feet[:, -1] - params.robot.foot_radius
-    ground = _mean_height(heights, stance, state.ground)
+    ground = mean_height(heights, stance, state.ground)
     wanted = next_reference(params, state, clock, view.planar, control_dt)
     task = ForceTask(
         clock=clock,
@@ -236,11 +250,11 @@ def _plan_from(
         time=state.time + control_dt,
         clock=clock,
         stance=stance,
-        lag=jnp.where(valid, wanted.lag, state.lag),
+        lag=jnp.where(valid, state.lag.at[0].set(wanted.lag), state.lag),
         command=wanted.command,
         height=wanted.height,
         ground=jnp.where(valid, ground, state.ground),
-        velocity=wanted.velocity,
+        velocity=state.velocity.at[0].set(wanted.velocity),
         correction=jnp.where(valid, wanted.correction, state.correction),
         memory=solved.memory,
         force=to_local(view, solved.force),
@@ -259,32 +273,6 @@ def _plan_from(
         blind_time=jnp.where(valid, 0.0, state.blind_time + spec.act_dt),
     )
     return next_state, info
-
-
-def _next_swings(
-    params: ControllerParams,
-    state: ControllerState,
-    clock: gait.Clock,
-    stance: Array,
-    flags: Array,
-    feet: Array,
-) -> swing.SwingState:
-    """Swings after the clock has moved on: begun, ended, or given another time to come down."""
-    switched = clock.gait != state.clock.gait
-    lifting = state.stance & ~stance
-    # A new gait gives legs that are in the air already another time to come down.
-    retimed = ~stance & switched
-    remaining = gait.time_to_touchdown(params.schedule, clock)
-    swings = swing.begin_swings(state.swing, lifting | retimed, feet, remaining)
-    interrupted = stance & ~state.stance & switched
-    return swing.end_swings(params.swing, swings, stance, interrupted, flags, feet)
-
-
-def _mean_height(heights: Array, stance: Array, otherwise: Array) -> Array:
-    """Mean height of the stance feet [m]; ``otherwise`` where none stands."""
-    count = jnp.sum(stance)
-    total = jnp.sum(jnp.where(stance, heights, 0.0))
-    return jnp.where(count > 0, total / jnp.maximum(count, 1), otherwise)
 
 
 def _above_ground(body: PlanarState, ground: Array) -> PlanarState:

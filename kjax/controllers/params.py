@@ -10,9 +10,10 @@ from jaxtyping import Array, Float, Int
 
 from kjax import gait
 from kjax.concrete import is_concrete
+from kjax.dynamics.srb_spatial import SpatialBody
 from kjax.koopman.models import LinearModel
 from kjax.legs import lateral, swing
-from kjax.mpc import horizon
+from kjax.mpc import horizon, momentum
 from kjax.mpc.lmpc import LmpcTables, ModeSettings, build_tables
 from kjax.precision import full_precision
 from kjax.prediction.build import Prediction
@@ -36,6 +37,30 @@ class Fits(NamedTuple):
     prediction: Prediction | None
 
 
+class SpatialParams(NamedTuple):
+    """Parameters of the LMPC in three dimensions.
+
+    Attributes:
+      body: mass and inertia of the prediction.
+      weights: of the errors, per second.
+      limits: of the forces.
+      grid: (2,) length of the horizon, and longest node where two feet stand [s].
+      force_z: (G, 2) mean vertical force of a front and a rear leg in its stance [N].
+      slew: of the reference yaw rate [rad/s^2].
+      heading_slack: clamp of the heading reference's lead [rad].
+      velocity_time: in which the velocity is predicted to reach its reference [s].
+    """
+
+    body: SpatialBody
+    weights: momentum.Weights
+    limits: momentum.Limits
+    grid: Float[Array, "2"]
+    force_z: Float[Array, "G 2"]
+    slew: Float[Array, ""]
+    heading_slack: Float[Array, ""]
+    velocity_time: Float[Array, ""]
+
+
 class ControllerParams(NamedTuple):
     """All parameters of a controller; data, so any leaf may be batched or replaced.
 
@@ -54,6 +79,7 @@ class ControllerParams(NamedTuple):
       reference: (G, ramp levels, P, samples, 4) periodic motion of each gait; see
         ``gait.reference``.
       multiphase: LMPC over a gait cycle, for gaits that use it.
+      spatial: LMPC in three dimensions; ``None`` for the planar controller.
       swing: swing settings.
       lateral: regulator of roll, yaw and sideways motion; of no effect on the planar base.
       command: what the robot is asked to do over time.
@@ -79,6 +105,7 @@ class ControllerParams(NamedTuple):
     gaits: Int[Array, "K"]
     reference: Float[Array, "G levels P samples 4"]
     multiphase: horizon.MultiPhaseParams
+    spatial: SpatialParams | None
     swing: swing.SwingParams
     lateral: lateral.LateralParams
     command: Command

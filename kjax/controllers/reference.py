@@ -47,10 +47,9 @@ def next_reference(
       body: as it is now.
       control_dt: of a tick [s].
     """
-    command = params.command.values[_piece(params.command.times, state.time)]
-    command = jnp.where(jnp.isfinite(command), command, state.command)
+    command = command_now(params, state)
     change, climb = params.command_slew * control_dt, params.height_slew * control_dt
-    velocity = state.velocity + jnp.clip(command[V_X] - state.velocity, -change, change)
+    velocity = state.velocity[0] + jnp.clip(command[V_X] - state.velocity[0], -change, change)
     height = state.height + jnp.clip(command[HEIGHT] - state.height, -climb, climb)
     periodic_ref = periodic_motion(params, clock.gait, clock.phase, clock.cycle, clock.elapsed)
     error = jnp.stack([velocity - body.x[3], periodic_ref[1] - body.x[2]])
@@ -61,8 +60,14 @@ def next_reference(
     switched = clock.gait != state.clock.gait
     correction = jnp.where(switched, 0.0, jnp.clip(correction, -limit, limit))
     slack = params.position_slack
-    lag = state.lag + (velocity + correction[0] - body.x[3]) * control_dt
+    lag = state.lag[0] + (velocity + correction[0] - body.x[3]) * control_dt
     return Reference(jnp.clip(lag, -slack, slack), command, velocity, height, correction)
+
+
+def command_now(params: ControllerParams, state: ControllerState) -> Float[Array, "6"]:
+    """The command in force; the last one where it is not finite."""
+    command = params.command.values[_piece(params.command.times, state.time)]
+    return jnp.where(jnp.isfinite(command), command, state.command)
 
 
 def next_clock(params: ControllerParams, state: ControllerState, control_dt: float) -> gait.Clock:

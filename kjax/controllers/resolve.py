@@ -18,6 +18,7 @@ from kjax.config.units import InSi, in_si
 from kjax.controllers.params import ControllerParams, Fits
 from kjax.controllers.resolve_fits import fit_models, warn_of_fits
 from kjax.controllers.resolve_model import resolve_model
+from kjax.controllers.resolve_spatial import spatial_params, spatial_spec
 from kjax.controllers.rigid_body import body_numbers, levers, mean_force
 from kjax.controllers.walkable import (
     Problem,
@@ -88,6 +89,7 @@ def controller_spec(config: RunConfig) -> ControllerSpec:
         tolerance=lmpc.tolerance,
         max_iterations=lmpc.max_iterations,
         cycle=cycle if nodes else None,
+        spatial=spatial_spec(gaits, config.spatial) if config.controller == "spatial" else None,
         gaits=tuple((len(one.phases), one.ramp_cycles) for one in gaits),
         modes=tuple(problem.mode for problem in contact_problems(gaits, config)[0]),
     )
@@ -108,6 +110,8 @@ def controller_key(config: RunConfig) -> Hashable:
         asked,
         config.gaits,
         config.multiphase,
+        config.controller,
+        config.spatial,
         config.leg,
         config.lateral,
         config.sim.base,
@@ -139,6 +143,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
         gait_times=_number(si.gait.times),
         reference=_reference_tables(gaits, si, robot),
         multiphase=multiphase_params(gaits, si, robot),
+        spatial=spatial_params(gaits, si, robot) if config.controller == "spatial" else None,
         swing=swing.SwingParams(
             apex=_column(si, names, "swing_height"),
             velocity_gain=_column(si, names, "foothold_gain"),

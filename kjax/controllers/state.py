@@ -8,6 +8,7 @@ from kjax import gait
 from kjax.legs.contact import ContactState
 from kjax.legs.swing import SwingState
 from kjax.mpc.lmpc import LmpcMemory
+from kjax.mpc.momentum import MomentumMemory
 
 
 class ControllerState(NamedTuple):
@@ -21,15 +22,18 @@ class ControllerState(NamedTuple):
       time: since ``init`` [s].
       clock: gait, phase and time in it.
       stance: (4,) scheduled stance legs.
-      lag: reference of p_x less p_x, the integral of the velocity's error, bounded [m].
+      lag: (2,) reference of the place less the place, the velocity's error integrated, bounded;
+        ahead and 0 in the planar controller, local axes in the spatial one [m].
+      heading: reference of the yaw since ``init``; 0 in the planar controller [rad].
       command: (6,) in force now, order of ``types.COMMAND_NAMES``.
       height: reference of the height above the gait's own, which follows the command at a bounded
         rate [m].
       ground: height of the ground under the last stance feet, local frame [m].
-      velocity: reference of v_x, which follows the command at a bounded rate [m/s].
+      velocity: (3,) references of v_x, v_y and yaw rate, which follow the command at bounded rates;
+        the planar controller's has v_x alone [m/s, m/s, rad/s].
       correction: integrals of the errors of velocity and pitch, added to their references
         [m/s, rad].
-      memory: of the LMPC within a stance: its last plan and where the QP goes on from.
+      memory: of the LMPC: its last plan and where the QP goes on from.
       force: (4, 3) force that each leg shall put on the robot, local axes; it holds in them until
         the next plan [N].
       swing: state of the swing legs, local frame.
@@ -45,13 +49,14 @@ class ControllerState(NamedTuple):
     time: Float[Array, ""]
     clock: gait.Clock
     stance: Bool[Array, "4"]
-    lag: Float[Array, ""]
+    lag: Float[Array, "2"]
+    heading: Float[Array, ""]
     command: Float[Array, "6"]
     height: Float[Array, ""]
     ground: Float[Array, ""]
-    velocity: Float[Array, ""]
+    velocity: Float[Array, "3"]
     correction: Float[Array, "2"]
-    memory: LmpcMemory
+    memory: LmpcMemory | MomentumMemory
     force: Float[Array, "4 3"]
     swing: SwingState
     feet: Float[Array, "4 d"]

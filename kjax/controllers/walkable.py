@@ -97,7 +97,8 @@ def check_walkable(config: RunConfig, robot: RobotParams) -> None:
     Warns:
       UserWarning: for another mass than the robot's.
     """
-    check_command({name: getattr(config.command, name) for name in COMMAND_NAMES})
+    columns = {name: getattr(config.command, name) for name in COMMAND_NAMES}
+    check_command(columns, planar=config.controller == "planar")
     _check_body(config, robot)
     walked = reachable_gaits(config.gaits, config.gait.names)
     for one in build_gaits(config):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kjax.legs import lateral, spatial, swing
+from kjax.legs.footholds import Arrival, footholds
 from kjax.legs.kinematics import PlanarState, foot_jacobian, planar_state
 from kjax.legs.stance import spatial_stance_torque, stance_torque
 from kjax.types import Observation, RobotParams
@@ -72,13 +73,13 @@ class Footing(NamedTuple):
     Attributes:
       remaining: (4,) time to touchdown [s].
       stance_time: (4,) length of the stance to come [s].
-      velocity: forward velocity wanted [m/s].
+      velocity: (3,) v_x, v_y and yaw rate wanted [m/s, m/s, rad/s].
       ground: height of the ground, frame of the view [m].
     """
 
     remaining: Float[Array, "4"]
     stance_time: Float[Array, "4"]
-    velocity: Float[Array, ""]
+    velocity: Float[Array, "3"]
     ground: Float[Array, ""]
 
 
@@ -114,8 +115,21 @@ class Base(NamedTuple):
     ]
 
 
-def build_base(kind: Literal["planar", "free"]) -> Base:
-    """The functions of a base."""
+def build_base(kind: Literal["planar", "free"], *, spatial_forces: bool = False) -> Base:
+    """The functions of a base.
+
+    Args:
+      kind: of base.
+      spatial_forces: whether forces are planned in three dimensions, so that no regulator acts
+        besides and footholds turn with the trunk.
+    """
+    if spatial_forces:
+        return Base(
+            track=spatial.heading,
+            view=_free_view,
+            foothold=_turning_foothold,
+            joints=_spatial_joints,
+        )
     if kind == "planar":
         return Base(
             track=_no_track, view=_planar_view, foothold=planar_foothold, joints=_planar_joints
@@ -152,7 +166,7 @@ def planar_foothold(
 ) -> Float[Array, "4 2"]:
     """Next footholds (x, z) in the sagittal plane, foot centres [m]."""
     along = swing.foothold(
-        robot, settings, view.planar, footing.remaining, footing.stance_time, footing.velocity
+        robot, settings, view.planar, footing.remaining, footing.stance_time, footing.velocity[0]
     )
     return jnp.stack([along, jnp.full_like(along, footing.ground + robot.foot_radius)], axis=-1)
 
@@ -207,7 +221,7 @@ def _free_foothold(
     body = view.whole
     assert body is not None  # _free_view made it
     along = swing.foothold(
-        robot, settings, body.planar, footing.remaining, footing.stance_time, footing.velocity
+        robot, settings, body.planar, footing.remaining, footing.stance_time, footing.velocity[0]
     )
     return swing.spatial_foothold(
         robot,
@@ -218,6 +232,63 @@ def _free_foothold(
         sideways.foothold_gain,
         footing.ground,
     )
+
+
+def _turning_foothold(
+    robot: RobotParams,
+    settings: swing.SwingParams,
+    sideways: lateral.LateralParams,
+    view: View,
+    footing: Footing,
+) -> Float[Array, "4 3"]:
+    """Next footholds beside the hips of a trunk that turns, foot centres [m]."""
+    body = view.whole
+    assert body is not None  # _free_view made it
+    wait, yaw_rate = footing.remaining, footing.velocity[2]
+    angle = body.yaw + yaw_rate * wait
+    velocity = spatial.rotate(body.heading, body.com_vel)
+    place = footholds(
+        robot,
+        settings.offset,
+        Arrival(
+            place=body.com[None, :2] + wait[:, None] * velocity[None, :2],
+            velocity=jnp.broadcast_to(velocity[:2], (4, 2)),
+            error=jnp.broadcast_to(velocity[:2], (4, 2)) - _turned(angle, footing.velocity[:2]),
+            heading=jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1),
+        ),
+        body.rotation.T @ (body.com - body.base),
+        footing.stance_time,
+        jnp.stack([settings.velocity_gain, sideways.foothold_gain]),
+        yaw_rate,
+    )
+    height = jnp.full_like(place[:, :1], footing.ground + robot.foot_radius)
+    return jnp.concatenate([place, height], axis=1)
+
+
+def _turned(angle: Float[Array, "4"], vector: Float[Array, "2"]) -> Float[Array, "4 2"]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]], axis=-1)
+
+
+def _spatial_joints(
+    robot: RobotParams,
+    settings: swing.SwingParams,
+    sideways: lateral.LateralParams,
+    view: View,
+    command: LegCommand,
+    observation: Observation,
+) -> JointTargets:
+    """All joints press with the planned forces, or follow the path of a swing."""
+    body = view.whole
+    assert body is not None  # _free_view made it
+    angle, rate = swing.spatial_joint_reference(robot, body, command.foot, command.foot_vel)
+    follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
+    press = spatial_stance_torque(robot, body.hip, body.planar.trig, command.force @ body.rotation)
+    # A sideways force has nothing to push against before the foot is down: keep the leg upright.
+    loose = command.stance & ~observation.contact
+    tracks = jnp.broadcast_to(~command.stance[:, None], press.shape)
+    tracks = tracks.at[:, 0].set(~command.stance | loose)
+    return JointTargets(jnp.where(tracks, follow, press), angle, rate, tracks)
 
 
 def _free_joints(

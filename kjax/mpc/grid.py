@@ -64,14 +64,17 @@ def build_grid(
       schedule: of all gaits.
       clock: now.
       count: number K of nodes; where they do not suffice the horizon is shorter.
-      node_dt: longest node of a stance [s].
+      node_dt: longest node where two feet stand, longer in proportion where more do [s].
       horizon: length [s].
       shortest: least time left of the present phase [s].
     """
     ahead = gait.preview(schedule, clock, shortest)
     duration = jnp.clip(horizon - ahead.begin, 0.0, ahead.duration)
     standing = schedule.stance[clock.gait, ahead.phase]
-    wanted = jnp.where(standing.any(axis=1), jnp.ceil(duration / node_dt - 1e-4), 1.0)
+    count_now = standing.sum(axis=1)
+    # As many forces whether two feet stand or four.
+    longest = node_dt * jnp.maximum(count_now, 2) / 2
+    wanted = jnp.where(count_now > 0, jnp.ceil(duration / longest - 1e-4), 1.0)
     # A sliver of a phase, left over by rounding, is no node.
     number = jnp.where(duration > 1e-5, jnp.maximum(wanted, 1.0), 0.0).astype(jnp.int32)
     last = jnp.cumsum(number)

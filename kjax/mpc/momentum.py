@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from kjax import qp
 from kjax.dynamics import rotations, srb_spatial
@@ -76,6 +76,20 @@ class Limits(NamedTuple):
 
     friction: Float[Array, ""]
     force_z: Float[Array, "2"]
+
+
+class MomentumMemory(NamedTuple):
+    """The last plan, for the next one to begin from.
+
+    Attributes:
+      force: (K, 4, 3) force of each leg in each node, axes of the local frame [N].
+      end: (K,) time from then to the node's end [s].
+      planned: whether there is one.
+    """
+
+    force: Float[Array, "K 4 3"]
+    end: Float[Array, "K"]
+    planned: Bool[Array, ""]
 
 
 class Response(NamedTuple):
@@ -172,6 +186,29 @@ def _node(
     speed = jnp.broadcast_to(h / m * eye, (4, 3, 3))
     B = jnp.concatenate([by_L[None] @ L_by_foot, place, L_by_foot, speed], axis=1)
     return A, B
+
+
+def shifted(
+    memory: MomentumMemory,
+    grid: Grid,
+    otherwise: Float[Array, "K 4 3"],
+    passed: float,
+) -> Float[Array, "K 4 3"]:
+    """The last plan's forces in the nodes of a new grid: what the prediction is made about.
+
+    Args:
+      memory: the last plan.
+      grid: new nodes.
+      otherwise: forces of legs that pressed nothing then, and beyond the plan's end [N].
+      passed: time since the plan [s].
+    """
+    middle = passed + grid.end - 0.5 * grid.length
+    node = jnp.sum(middle[:, None] >= memory.end[None], axis=1)
+    within = node < memory.end.shape[0]
+    force = memory.force[jnp.minimum(node, memory.end.shape[0] - 1)]
+    known = (within & memory.planned)[:, None] & (force[..., 2] != 0.0)
+    force = jnp.where(known[..., None], force, otherwise)
+    return jnp.where(grid.stance[..., None], force, 0.0)
 
 
 def errors(

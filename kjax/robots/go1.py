@@ -45,7 +45,13 @@ def _f(values: Any) -> Array:
 PARAMS = RobotParams(
     mass=_f(_TRUNK_MASS + 4 * _LINK_MASS.sum()),  # 12.743 kg
     # Composite inertia of all links about the common centre of mass, in the nominal stance.
-    pitch_inertia=_f(0.394350),
+    inertia=_f(
+        [
+            [0.127259, -0.000438, -0.014365],
+            [-0.000438, 0.394350, -0.000092],
+            [-0.014365, -0.000092, 0.422779],
+        ]
+    ),
     trunk_mass=_f(_TRUNK_MASS),
     trunk_com=_f([0.0223, 0.002, -0.0005]),
     link_mass=_f(_LINK_MASS),

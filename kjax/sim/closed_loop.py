@@ -171,7 +171,7 @@ def build_closed_loop(
             stance=next_state.stance,
             force=next_state.force,
             velocity_command=next_state.command[0],
-            velocity_reference=next_state.velocity,
+            velocity_reference=next_state.velocity[0],
             status=info.status,
             residual=info.residual,
             iterations=info.iterations,

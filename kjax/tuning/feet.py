@@ -38,7 +38,7 @@ def touch_down(
         view(robot, plant.com, x, feet).planar,
         jnp.zeros((4,), x.dtype),
         params.schedule.stance_time[where],
-        state.velocity + state.correction[0],
+        state.velocity[0] + state.correction[0],
     )
     place = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
     return jnp.where(landing[:, None], place, feet)
@@ -56,7 +56,7 @@ def swing_feet(
         body,
         gait.time_to_touchdown(params.schedule, clock),
         params.schedule.stance_time[clock.gait, clock.phase],
-        state.velocity + state.correction[0],
+        state.velocity[0] + state.correction[0],
     )
     target = jnp.stack([along, jnp.full_like(along, robot.foot_radius)], axis=1)
     # The controller keeps lift-off points relative to the trunk; here everything is in the world.

@@ -197,7 +197,7 @@ def _build_tick(
         alive = carry.alive & _upright(next_x)
         record = Trace(
             x=x,
-            wanted=jnp.stack([state.velocity, params.height[state.clock.gait] + state.height]),
+            wanted=jnp.stack([state.velocity[0], params.height[state.clock.gait] + state.height]),
             feet=feet,
             stance=state.stance,
             mode=info.mode,

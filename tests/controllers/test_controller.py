@@ -443,9 +443,9 @@ def test_the_reference_velocity_follows_the_command_at_its_largest_rate(
     states, infos = plans(controller, tables, plan, 30)
     ramp = -0.5 * np.minimum(np.arange(1, 31) / ticks, 1.0)
     # Sums of up to 30 terms, rounded.
-    np.testing.assert_allclose(states.velocity, ramp, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(states.velocity[:, 0], ramp, rtol=0, atol=1e-14)
     np.testing.assert_allclose(infos.reference[:, 3], ramp, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(states.lag, 0.005 * np.cumsum(ramp), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(states.lag[:, 0], 0.005 * np.cumsum(ramp), rtol=0, atol=1e-14)
     np.testing.assert_array_equal(states.command[:, 0], -0.5)
 
 
@@ -538,7 +538,7 @@ def test_the_reference_velocity_follows_the_command_at_a_bounded_rate(controller
     velocities = []
     for _ in range(30):
         state, _ = plan(stepped, state, standing())
-        velocities.append(float(state.velocity))
+        velocities.append(float(state.velocity[0]))
     # 4 m/s^2 at 200 Hz: 0.02 m/s a tick, 0.4 m/s after 20 of them
     np.testing.assert_allclose(velocities, np.minimum(0.02 * np.arange(1, 31), 0.4), atol=1e-12)
     assert float(state.command[0]) == 0.4
@@ -640,7 +640,7 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         model = families.operating_point(family, model_params, start, force, 4)
         ahead = config.lmpc.model_dt * jnp.arange(1, 6)
         reference = reference_trajectory(
-            position=state.lag, velocity=state.velocity, height=tables.params.height[0],
+            position=state.lag[0], velocity=state.velocity[0], height=tables.params.height[0],
             periodic=jnp.zeros((5, 4)), ahead=ahead,
         )  # fmt: skip
         z = family.lift(model_params, start)

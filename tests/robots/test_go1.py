@@ -113,16 +113,17 @@ def test_link_inertias_are_those_of_the_model(model):
             assert (R @ np.diag(body.inertia) @ R.T)[1, 1] == pytest.approx(own, rel=2e-3)
 
 
-def test_the_composite_pitch_inertia_is_that_of_the_nominal_stance(planar_go1, standing):
+def test_the_composite_inertia_is_that_of_the_nominal_stance(planar_go1, standing):
     com = standing.subtree_com[planar_go1.body("trunk").id]
-    total = 0.0
+    total = np.zeros((3, 3))
     for i in range(1, planar_go1.nbody):
         R = standing.ximat[i].reshape(3, 3)
         arm = standing.xipos[i] - com
-        total += (R @ np.diag(planar_go1.body_inertia[i]) @ R.T)[1, 1]
-        total += planar_go1.body_mass[i] * (arm[0] ** 2 + arm[2] ** 2)
-    # The constant is given to a mg m^2.
-    np.testing.assert_allclose(go1.PARAMS.pitch_inertia, total, rtol=0, atol=1e-6)
+        total += R @ np.diag(planar_go1.body_inertia[i]) @ R.T
+        total += planar_go1.body_mass[i] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    # The constants are given to a mg m^2.
+    np.testing.assert_allclose(go1.PARAMS.inertia, total, rtol=0, atol=1e-6)
+    assert go1.PARAMS.pitch_inertia == go1.PARAMS.inertia[1, 1]
 
 
 def test_standing_puts_the_feet_on_the_ground_below_the_hips(planar_go1, standing):

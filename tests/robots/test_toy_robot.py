@@ -74,7 +74,7 @@ def test_its_numbers_are_those_of_its_model(model, at):
     assert (ours.max(axis=0) > params.joint_range[:, 1]).all()
 
 
-def test_its_pitch_inertia_is_that_of_its_nominal_stance(model, at):
+def test_its_inertia_is_that_of_its_nominal_stance(model, at):
     data = mujoco.MjData(model)
     height, joints = stand_pose(ROBOT.params, float(ROBOT.params.stand_height))
     data.qpos[2], data.qpos[3] = height, 1.0
@@ -82,12 +82,12 @@ def test_its_pitch_inertia_is_that_of_its_nominal_stance(model, at):
     mujoco.mj_forward(model, data)
     com = data.subtree_com[at.trunk]
     assert com[2] == pytest.approx(0.36, abs=1e-11)
-    inertia = 0.0
+    inertia = np.zeros((3, 3))
     for body in range(1, model.nbody):
         R, arm = data.ximat[body].reshape(3, 3), data.xipos[body] - com
-        inertia += (R @ np.diag(model.body_inertia[body]) @ R.T)[1, 1]
-        inertia += model.body_mass[body] * (arm[0] ** 2 + arm[2] ** 2)
-    assert float(ROBOT.params.pitch_inertia) == pytest.approx(inertia, abs=1e-6)
+        inertia += R @ np.diag(model.body_inertia[body]) @ R.T
+        inertia += model.body_mass[body] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    np.testing.assert_allclose(ROBOT.params.inertia, inertia, rtol=0, atol=1e-6)
 
 
 def test_its_joints_are_read_in_our_convention(model, at):

@@ -13,7 +13,9 @@ _ZERO, _ONE = np.zeros(4), np.ones(4)
 
 PARAMS = RobotParams(
     mass=np.asarray(12.0 + 4 * (1.1 + 1.9 + 0.35)),
-    pitch_inertia=np.asarray(1.481031),
+    inertia=np.array(
+        [[0.421826, 0.0, -0.047472], [0.0, 1.481031, 0.0], [-0.047472, 0.0, 1.591930]]
+    ),
     trunk_mass=np.asarray(12.0),
     trunk_com=np.array([0.01, 0.0, 0.005]),
     link_mass=np.array([1.1, 1.9, 0.35]),

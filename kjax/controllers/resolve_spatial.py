@@ -1,0 +1,70 @@
+"""From a config to the LMPC in three dimensions: its spec and its parameters."""
+
+from itertools import accumulate
+from math import ceil
+from typing import Any
+
+from kjax import gait
+from kjax.concrete import array_library, stacked
+from kjax.config import SpatialConfig
+from kjax.config.units import InSi
+from kjax.controllers.params import SpatialParams
+from kjax.controllers.rigid_body import body_numbers, mean_force
+from kjax.dynamics.srb_spatial import SpatialBody
+from kjax.mpc import momentum
+from kjax.spec import SpatialSpec
+from kjax.types import RobotParams
+
+
+def spatial_spec(gaits: list[gait.Gait], config: SpatialConfig) -> SpatialSpec:
+    """Sizes that suffice for every place in every gait."""
+    borders = max(_borders(one, config.horizon) for one in gaits)
+    whole = ceil(config.horizon / config.node_dt - 1e-6)
+    return SpatialSpec(
+        nodes=whole + borders,
+        feet=2 * (whole + borders),
+        tolerance=config.tolerance,
+        max_iterations=config.max_iterations,
+    )
+
+
+def _borders(one: gait.Gait, horizon: float) -> int:
+    """Largest number of ends of phases that a horizon holds."""
+    durations = one.durations(0) * (2 + ceil(horizon / sum(one.durations(0))))
+    most = 1
+    for first in range(len(one.phases)):
+        ends = accumulate(durations[first:], initial=0.0)
+        most = max(most, sum(end < horizon for end in ends))
+    return most
+
+
+def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> SpatialParams:
+    """Parameters from a config in SI units."""
+    own = config.spatial
+    mass, pitch_inertia = body_numbers(config, robot)
+    inertia = robot.inertia * (pitch_inertia / robot.pitch_inertia)
+    numbers = array_library(mass, inertia)
+    return SpatialParams(
+        body=SpatialBody(
+            mass=numbers.asarray(mass, float), inertia=numbers.asarray(inertia, float)
+        ),
+        weights=momentum.Weights(
+            attitude=_floats(own.attitude),
+            position=_floats(own.position),
+            omega=_floats(own.omega),
+            velocity=_floats(own.velocity),
+            force=_floats(own.force),
+        ),
+        limits=momentum.Limits(
+            friction=_floats(own.friction), force_z=stacked([own.grf_z_min, own.grf_z_max])
+        ),
+        grid=stacked([own.horizon, own.node_dt]),
+        force_z=mean_force(gaits, config, robot),
+        slew=_floats(own.yaw_slew),
+        heading_slack=_floats(own.heading_slack),
+        velocity_time=_floats(own.velocity_time),
+    )
+
+
+def _floats(value: Any) -> Any:
+    return array_library(value).asarray(value, float)

@@ -1,0 +1,285 @@
+"""The plan in three dimensions: references, horizon, footholds, forces.
+
+Everything is in the local frame of ``ControllerState``, its origin moved to the ground below the
+centre of mass; headings are counted from the track.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from kjax import gait, qp
+from kjax.controllers.command import HEIGHT, PITCH, ROLL, V_X, V_Y, YAW_RATE
+from kjax.controllers.contacts import mean_height, next_swings
+from kjax.controllers.params import ControllerParams, Tables
+from kjax.controllers.planning import periodic_motion
+from kjax.controllers.reference import command_now, next_clock
+from kjax.controllers.state import ControllerState, PlanInfo
+from kjax.dynamics import rotations, srb_spatial
+from kjax.dynamics.srb_spatial import BodyState
+from kjax.legs import contact, lateral, spatial, swing
+from kjax.legs.base import View
+from kjax.legs.footholds import Arrival, footholds
+from kjax.mpc import grid, momentum
+from kjax.mpc.momentum import MomentumMemory
+from kjax.spec import ControllerSpec, SpatialSpec
+
+USABLE = 1e-2  # residual up to which a plan at the iteration limit walks better than none
+
+PlanFrom = Callable[[Tables, ControllerState, View, Array, Array], tuple[ControllerState, PlanInfo]]
+
+
+class _Motion(NamedTuple):
+    """What the body shall do from now on.
+
+    Attributes:
+      command: (6,) in force.
+      velocity: (3,) references of v_x, v_y and yaw rate.
+      height: reference of the height above the gait's own [m].
+      heading: reference of the yaw now [rad].
+      lag: (2,) reference of the place less the place [m].
+      lead: (2,) velocity less its reference [m/s].
+    """
+
+    command: Float[Array, "6"]
+    velocity: Float[Array, "3"]
+    height: Float[Array, ""]
+    heading: Float[Array, ""]
+    lag: Float[Array, "2"]
+    lead: Float[Array, "2"]
+
+    def at(self, t: Float[Array, "*k"]) -> tuple[Array, Array, Array]:
+        """Way (*k, 2) and velocity (*k, 2) wanted, and heading (*k,), after a time ``t`` [s]."""
+        angle = self.velocity[2] * t
+        small = jnp.abs(angle) < 1e-4
+        safe = jnp.where(small, 1.0, angle)
+        ahead = jnp.where(small, 1.0 - angle**2 / 6.0, jnp.sin(safe) / safe)
+        across = jnp.where(small, 0.5 * angle, (1.0 - jnp.cos(safe)) / safe)
+        now = _turned(self.heading, self.velocity[:2])
+        way = jnp.stack(
+            [ahead * now[0] - across * now[1], across * now[0] + ahead * now[1]], axis=-1
+        )
+        heading = self.heading + angle
+        return t[..., None] * way, _turned(heading, self.velocity[:2]), heading
+
+
+def start_spatial(spec: SpatialSpec, dtype: jnp.dtype) -> MomentumMemory:
+    """What is remembered before the first plan."""
+    return MomentumMemory(
+        force=jnp.zeros((spec.nodes, 4, 3), dtype),
+        end=jnp.zeros((spec.nodes,), dtype),
+        planned=jnp.zeros((), bool),
+    )
+
+
+def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
+    """``Controller.plan_from`` of the LMPC in three dimensions."""
+    assert spec.spatial is not None
+    sizes, control_dt = spec.spatial, spec.control_dt
+
+    def plan_from(
+        tables: Tables, state: ControllerState, view: View, flags: Array, valid: Array
+    ) -> tuple[ControllerState, PlanInfo]:
+        params = tables.params
+        own, body = params.spatial, view.whole
+        assert own is not None
+        assert body is not None  # a free base's view has it
+        assert isinstance(state.memory, MomentumMemory)
+        clock = next_clock(params, state, control_dt)
+        stance = params.schedule.stance[clock.gait, clock.phase]
+        feet = jnp.where(valid, view.feet, state.feet)
+        swings = next_swings(params, state, clock, stance, flags, feet)
+        ground = mean_height(feet[:, 2] - params.robot.foot_radius, stance, state.ground)
+
+        velocity = spatial.rotate(body.heading, body.com_vel)
+        omega = spatial.rotate(body.heading, body.omega)
+        origin = jnp.stack([body.com[0], body.com[1], ground])
+        start = BodyState(
+            p=body.com - origin,
+            R=body.rotation,
+            v=velocity,
+            L=srb_spatial.momentum(own.body, body.rotation, omega),
+        )
+        motion = _next_motion(params, state, body.yaw, velocity, control_dt)
+        nodes = grid.build_grid(
+            params.schedule, clock, sizes.nodes,
+            node_dt=own.grid[1], horizon=own.grid[0], shortest=0.5 * control_dt,
+        )  # fmt: skip
+        targets = _targets(params, clock, nodes, motion)
+        com = body.rotation.T @ (body.com - body.base)
+        contacts = _contacts(params, clock, nodes, motion, feet - origin[None], com)
+        nominal = momentum.shifted(state.memory, nodes, targets.force, control_dt)
+        solved = momentum.solve(
+            own.body,
+            start,
+            nodes,
+            contacts,
+            nominal,
+            targets,
+            own.weights,
+            own.limits,
+            grid.list_feet(nodes.stance, sizes.feet),
+            tolerance=sizes.tolerance,
+            max_iterations=sizes.max_iterations,
+        )
+        usable = (solved.status <= qp.Status.ITERATION_LIMIT) & (solved.residual < USABLE) & valid
+        force = jnp.where(usable, solved.force, nominal)
+        next_state = state._replace(
+            time=state.time + control_dt,
+            clock=clock,
+            stance=stance,
+            lag=jnp.where(valid, motion.lag, state.lag),
+            heading=jnp.where(valid, motion.heading, state.heading),
+            command=motion.command,
+            height=motion.height,
+            ground=jnp.where(valid, ground, state.ground),
+            velocity=motion.velocity,
+            memory=MomentumMemory(force, nodes.end, jnp.ones((), bool)),
+            force=jnp.where(stance[:, None], force[0], 0.0),
+            swing=swings,
+            feet=feet,
+        )
+        first = jax.tree.map(lambda a: a[0], targets)
+        info = PlanInfo(
+            status=jnp.where(valid, solved.status, qp.Status.NON_FINITE).astype(jnp.int32),
+            residual=jnp.where(valid, solved.residual, jnp.inf),
+            iterations=solved.iterations,
+            mode=params.schedule.mode[clock.gait, clock.phase],
+            x=jnp.concatenate([_angles(start.R), start.p, omega, velocity]),
+            reference=jnp.concatenate([_angles(first.R), first.p, first.omega, first.v]),
+            contact_fault=contact.is_faulty(state.contact),
+            command_ignored=jnp.zeros((), bool),
+            blind_time=jnp.where(valid, 0.0, state.blind_time + spec.act_dt),
+        )
+        return next_state, info
+
+    return plan_from
+
+
+def _next_motion(
+    params: ControllerParams,
+    state: ControllerState,
+    yaw: Float[Array, ""],
+    velocity: Float[Array, "3"],
+    control_dt: float,
+) -> _Motion:
+    """References one control tick on."""
+    own = params.spatial
+    assert own is not None
+    command = command_now(params, state)
+    wanted = jnp.stack([command[V_X], command[V_Y], command[YAW_RATE]])
+    change = control_dt * jnp.stack([params.command_slew, params.command_slew, own.slew])
+    reference = state.velocity + jnp.clip(wanted - state.velocity, -change, change)
+    climb = params.height_slew * control_dt
+    height = state.height + jnp.clip(command[HEIGHT] - state.height, -climb, climb)
+    ahead = _wrapped(state.heading + reference[2] * control_dt - yaw)
+    heading = _wrapped(yaw + jnp.clip(ahead, -own.heading_slack, own.heading_slack))
+    lead = velocity[:2] - _turned(heading, reference[:2])
+    slack = params.position_slack
+    lag = jnp.clip(state.lag - lead * control_dt, -slack, slack)
+    return _Motion(command, reference, height, heading, lag, lead)
+
+
+def _targets(
+    params: ControllerParams, clock: gait.Clock, nodes: grid.Grid, motion: _Motion
+) -> momentum.Targets:
+    """What the body shall do at the nodes' ends, in the frame of the plan."""
+    own = params.spatial
+    assert own is not None
+    way, velocity, heading = motion.at(nodes.end)
+    place = nodes.end - nodes.begin
+    periodic = periodic_motion(params, clock.gait, nodes.phase, nodes.cycle, place)
+    z, theta, v_z, pitch_rate = periodic.T
+    zero = jnp.zeros_like(z)
+
+    def about(angle: Array, axis: int) -> Array:
+        return rotations.exp(jnp.stack([angle if i == axis else zero for i in range(3)], axis=-1))
+
+    turn = about(heading, 2)
+    roll = jnp.broadcast_to(motion.command[ROLL], z.shape)
+    # Nose up is a turn about the axis to the right.
+    R = turn @ about(-(theta + motion.command[PITCH]), 1) @ about(roll, 0)
+    omega = jnp.stack([zero, -pitch_rate, zero + motion.velocity[2]], axis=-1)
+    height = params.height[clock.gait] + motion.height + z
+    full = params.schedule.duration[clock.gait]
+    used = jnp.arange(full.shape[0]) < params.schedule.phases[clock.gait]
+    ahead = gait.preview(params.schedule, clock, 0.0).duration.sum()
+    load = own.force_z[clock.gait] * (ahead / jnp.sum(jnp.where(used, full, 0.0)))
+    force_z = jnp.where(nodes.stance, jnp.repeat(load, 2)[None], 0.0)
+    flat = jnp.zeros_like(force_z)
+    return momentum.Targets(
+        R=R,
+        p=jnp.concatenate([motion.lag[None] + way, height[:, None]], axis=1),
+        omega=jnp.einsum("kij,kj->ki", turn, omega),
+        v=jnp.concatenate([velocity, v_z[:, None]], axis=1),
+        heading=jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1),
+        force=jnp.stack([flat, flat, force_z], axis=-1),
+    )
+
+
+def _contacts(
+    params: ControllerParams,
+    clock: gait.Clock,
+    nodes: grid.Grid,
+    motion: _Motion,
+    feet: Float[Array, "4 3"],
+    com: Float[Array, "3"],
+) -> Float[Array, "K 4 3"]:
+    """Contact points of the legs in each node: where they stand, or will."""
+    own = params.spatial
+    assert own is not None
+    index = jnp.arange(nodes.length.shape[0])
+    # First node of the unbroken stance that a leg is in.
+    lifted = jax.lax.cummax(jnp.where(nodes.stance, -1, index[:, None]), axis=0)
+    first = jnp.minimum(lifted + 1, index[:, None])
+    wait = jnp.maximum(nodes.begin[first], 0.0)
+    way, velocity, heading = motion.at(wait)
+    fade = jnp.exp(-wait / own.velocity_time)[..., None]
+    error = motion.lead * fade
+    stance_time = params.schedule.stance_time[clock.gait]
+    legs = jnp.broadcast_to(jnp.arange(4)[None], first.shape)
+    settings = swing.for_gait(params.swing, clock.gait)
+    sideways = lateral.for_gait(params.lateral, clock.gait)
+    arrival = Arrival(
+        place=way + motion.lead * own.velocity_time * (1.0 - fade),
+        velocity=velocity + error,
+        error=error,
+        heading=jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1),
+    )
+    place = jax.vmap(footholds, (None, None, 0, None, 0, None, None))(
+        params.robot,
+        settings.offset,
+        arrival,
+        com,
+        stance_time[nodes.phase[first], legs],
+        jnp.stack([settings.velocity_gain, sideways.foothold_gain]),
+        motion.velocity[2],
+    )
+    later = jnp.concatenate([place, jnp.zeros_like(place[..., :1])], axis=-1)
+    sole = jnp.stack([jnp.zeros_like(params.robot.foot_radius)] * 2 + [params.robot.foot_radius])
+    return jnp.where((lifted < 0)[..., None], (feet - sole[None])[None], later)
+
+
+def _angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Roll, pitch (nose up) and yaw [rad]."""
+    level = jnp.sqrt(R[0, 0] ** 2 + R[1, 0] ** 2)
+    return jnp.stack(
+        [
+            jnp.arctan2(R[2, 1], R[2, 2]),
+            jnp.arctan2(R[2, 0], level),
+            jnp.arctan2(R[1, 0], R[0, 0]),
+        ]
+    )
+
+
+def _turned(angle: Float[Array, "*k"], vector: Float[Array, "2"]) -> Float[Array, "*k 2"]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]], axis=-1)
+
+
+def _wrapped(angle: Float[Array, ""]) -> Float[Array, ""]:
+    """The angle within half a turn of zero [rad]."""
+    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
