@@ -66,22 +66,37 @@ def attitude(qpos: np.ndarray) -> tuple[Any, Any, Any]:
     return roll, pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])
 
 
-def metrics(qpos: np.ndarray, steady: np.ndarray) -> dict[str, float]:
-    """Largest roll and yaw, and how far the trunk strays from its first heading's line.
+def metrics(
+    qpos: np.ndarray, qvel: np.ndarray, wanted: np.ndarray, steady: np.ndarray
+) -> dict[str, float]:
+    """Roll and yaw, sideways and turning motion against the command, and the drift from a line.
+
+    The line is that of the first heading; the velocity is the trunk's, in its own heading.
 
     Args:
       qpos: (N, nq) of an episode; a planar one gives nothing.
+      qvel: (N, nv) its velocities.
+      wanted: (N, 2) v_y [m/s] and yaw rate [rad/s] in force.
       steady: (N,) samples that count.
     """
     if not is_free(qpos):
         return {}
     roll, _, yaw = attitude(qpos)
+    tilt = np.degrees(np.abs(roll[steady]))
     turned = np.angle(np.exp(1j * (yaw - yaw[0])))
     way = qpos[:, :2] - qpos[0, :2]
     drift = np.cos(yaw[0]) * way[:, 1] - np.sin(yaw[0]) * way[:, 0]
+    v_y = np.cos(yaw) * qvel[:, 1] - np.sin(yaw) * qvel[:, 0]
+    quat = qpos[:, [4, 5, 6, 3]]
+    rate = Rotation.from_quat(quat).apply(qvel[:, 3:6])[:, 2]  # about the vertical
+    missed = np.stack([v_y, rate], axis=-1)[steady] - wanted[steady]
+    rmse = np.sqrt(np.mean(missed**2, axis=0))
     return {
-        "roll_max_deg": float(np.degrees(np.abs(roll[steady])).max()),
+        "roll_max_deg": float(tilt.max()),
+        "roll_p95_deg": float(np.percentile(tilt, 95)),
         "yaw_max_deg": float(np.degrees(np.abs(turned[steady])).max()),
+        "velocity_y_rmse_mps": float(rmse[0]),
+        "yaw_rate_rmse_radps": float(rmse[1]),
         "lateral_drift_m": float(np.abs(drift[steady]).max()),
     }
 

@@ -28,9 +28,14 @@ def reference_height(
       time: (N,) since the start [s].
       goal: of the episode.
     """
-    command = goal.command
-    piece = np.searchsorted(command.times, time + 1e-9, side="right") - 1
-    return goal.heights[gait] + command.values[piece, COMMAND_NAMES.index("height")]
+    return goal.heights[gait] + _asked(time, goal, "height")[:, 0]
+
+
+def _asked(time: Float[np.ndarray, "N"], goal: Goal, *names: str) -> Float[np.ndarray, "N k"]:
+    """Columns of the command at some times."""
+    piece = np.searchsorted(goal.command.times, time + 1e-9, side="right") - 1
+    columns = [COMMAND_NAMES.index(name) for name in names]
+    return np.asarray(goal.command.values)[piece][:, columns]
 
 
 def metrics(run: Trajectory, goal: Goal, stats: TickStats | None = None) -> dict[str, Any]:
@@ -77,7 +82,7 @@ def metrics(run: Trajectory, goal: Goal, stats: TickStats | None = None) -> dict
         **_tracking(run, goal, stats, known),
         **_crossing(run, goal),
         **_switching(run, goal),
-        **free_base.metrics(run.qpos, steady),
+        **free_base.metrics(run.qpos, run.qvel, _asked(run.time, goal, "v_y", "yaw_rate"), steady),
         "foot_slip_m": float(stats.slip.sum() / _stances(run)),
         "torque_max_nm": float(stats.torque.max()),
         "torque_saturation_fraction": float(stats.saturated.sum() / stats.steps.sum()),
@@ -128,7 +133,10 @@ def metric_names(goal: Goal) -> set[str]:
     if len(goal.gait_times) > 1:
         names |= {"switch_time_s", "switch_pitch_max_deg", "pitch_settle_s"}
     if goal.scene.base == "free":
-        names |= {"roll_max_deg", "yaw_max_deg", "lateral_drift_m"}
+        names |= {
+            "roll_max_deg", "roll_p95_deg", "yaw_max_deg", "velocity_y_rmse_mps",
+            "yaw_rate_rmse_radps", "lateral_drift_m",
+        }  # fmt: skip
     return names
 
 

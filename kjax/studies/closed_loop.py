@@ -40,6 +40,8 @@ TABLE = (
     ("pitch_settle_s", "pitch settled after [s]", ".3f"),
     ("roll_max_deg", "roll, largest [deg]", ".2f"),
     ("yaw_max_deg", "yaw, largest [deg]", ".2f"),
+    ("velocity_y_rmse_mps", "RMSE of the sideways velocity [m/s]", ".4f"),
+    ("yaw_rate_rmse_radps", "RMSE of the yaw rate [rad/s]", ".4f"),
     ("lateral_drift_m", "sideways drift, largest [m]", ".3f"),
     ("height_mean_m", "CoM height, mean [m]", ".3f"),
     ("height_error_max_m", "CoM height, largest error [m]", ".3f"),

@@ -159,11 +159,22 @@ def test_metrics_measure_yaw_and_drift_from_the_first_heading():
     )
     qpos[:, :2] = [np.zeros(2), ahead + 0.3 * left, 2 * ahead - 0.1 * left]
     qpos[:, :2] += [5.0, -3.0]
-    result = free_base.metrics(qpos, np.ones(steps, bool))
+    qvel, rotation = np.zeros((steps, 18)), np.zeros(9)
+    for i, yaw in enumerate((0.0, 0.2, -0.1)):
+        c, s = np.cos(first + yaw), np.sin(first + yaw)
+        qvel[i, :2] = 0.5 * np.array([c, s]) + 0.2 * np.array([-s, c])
+        mujoco.mju_quat2Mat(rotation, qpos[i, 3:7])
+        qvel[i, 3:6] = rotation.reshape(3, 3).T @ [0.1, -0.2, 0.7]  # in the trunk's axes
+    wanted = np.tile([0.1, 0.4], (steps, 1))
+    result = free_base.metrics(qpos, qvel, wanted, np.ones(steps, bool))
+    assert result["velocity_y_rmse_mps"] == pytest.approx(0.1)
+    assert result["yaw_rate_rmse_radps"] == pytest.approx(0.3)
+    assert result["roll_p95_deg"] == pytest.approx(np.degrees(0.02 + 0.9 * 0.08))
     assert result["roll_max_deg"] == pytest.approx(np.degrees(0.1))
     assert result["yaw_max_deg"] == pytest.approx(np.degrees(0.2))
     assert result["lateral_drift_m"] == pytest.approx(0.3)
-    assert free_base.metrics(np.zeros((steps, 15)), np.ones(steps, bool)) == {}
+    planar = np.zeros((steps, 15))
+    assert free_base.metrics(planar, planar, wanted, np.ones(steps, bool)) == {}
 
 
 @pytest.fixture(scope="module")
