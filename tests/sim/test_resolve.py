@@ -56,7 +56,7 @@ VALUES = {
 }
 # What a controller or a scene is compiled for.
 STATIC = {
-    "robot",
+    "robot", "controller",
     "lmpc.control_dt", "lmpc.model_dt", "lmpc.horizon", "lmpc.uncertainty_discount", "lmpc.solver",
     "lmpc.warm_start", "lmpc.tolerance", "lmpc.max_iterations", "leg.act_dt",
     "koopman.model", "koopman.dictionary", "koopman.order", "koopman.fourier_count",
@@ -69,6 +69,8 @@ STATIC = {
     "sim.joint_armature", "sim.contact_threshold", "terrain.kind", "terrain.count",
     "noise.enabled", "noise.force",
 }  # fmt: skip
+# Likewise, of the spatial controller.
+SPATIAL = {"spatial.horizon", "spatial.node_dt", "spatial.tolerance", "spatial.max_iterations"}
 # What only means something beside other keys, needs a file, or is a list whose length counts.
 LEFT_OUT = {
     "koopman.file", "gait.times", "command.times", "push.times", "push.lateral",
@@ -133,14 +135,25 @@ def test_every_key_either_makes_another_program_or_none():
     assert changing == STATIC
 
 
-@pytest.mark.parametrize("base", ["planar", "free"])
-def test_what_a_batch_may_vary_changes_nothing_in_the_program(base):
-    own = {"sim.base": base}
-    varied = own | {name: value for name, value in keys() if name not in STATIC}
+@pytest.mark.parametrize("kind", ["planar", "free", "spatial"])
+def test_what_a_batch_may_vary_changes_nothing_in_the_program(kind):
+    spatial = kind == "spatial"
+    own = {"sim.base": "free", "controller": kind} if spatial else {"sim.base": kind}
+    fixed = STATIC | SPATIAL if spatial else STATIC
+    varied = own | {name: value for name, value in keys() if name not in fixed}
     config, other = (load_config(RunConfig, None, chosen) for chosen in (own, varied))
     assert batch_spec(other) == batch_spec(config)
     assert hash(batch_spec(other)) == hash(batch_spec(config))
     assert program(other) == program(config)
+
+
+def test_nodes_of_a_horizon_in_three_dimensions_make_another_program():
+    own = {"sim.base": "free", "controller": "spatial"}
+    values = {name: value for name, value in keys() if name in SPATIAL}
+    plain = batch_spec(load_config(RunConfig, None, own))
+    for name, value in values.items():
+        value = 0.4 if name == "spatial.horizon" else value
+        assert batch_spec(load_config(RunConfig, None, own | {name: value})) != plain
 
 
 def test_nodes_of_a_cycle_make_another_program():
