@@ -10,6 +10,7 @@ SHORT = {
     "$bound": "whole_body/bound/inside, 50ms, ",
     "$starts": "whole_body/bound/all_starts, 50ms, all",
     "$edmd": "benchmark_edmd",
+    "$qp": "benchmark_qp",
     "$learn": "learn_control",
     "$tuned": "tune_bound/mujoco",
     "$s/": "sweeps/",
@@ -41,6 +42,20 @@ QUOTES: dict[str, tuple[str, ...]] = {
         "{$starts/scheduled nominal, rms/0 | .3f} m/s before anything is learned, and to "
         "{$starts, against the frozen nominal/scheduled touchdown/0/0 | .2f} of it with a residual",
         "during pushes (with them {$trotall, during pushes as well/clock_history/0/0 | .2f} for",
+    ),
+    "docs/qp.md": (
+        "{$qp/box/trot_velocity/empty jitted call/us_median | .0f} µs go into an empty one",
+        "a warm call takes {$qp/size/400/kjax tableau, warm/us_median | 1e-3 * .1f} ms, a single "
+        "Newton step of an interior point with a Riccati recursion "
+        "{$qp/size/400/riccati, scan/us_median | 1e-3 * .1f} ms",
+        "that step takes {$qp/size/400/riccati, associative/us_median | 1e-3 * .1f} ms here",
+        "Of {$qp/random/solves | .0f} random warm-started box problems",
+        "{$qp/random/wrong_solved | .0f} were called solved that were not, and "
+        "{$qp/random/iteration_limit | .0f} ended at the iteration limit.",
+        "{$qp/random_rows_wrong | .0f} were called solved, infeasible or unbounded that were not.",
+        "agree with differences to {$qp/grad_rel_err_median | 1e12 * .0f}e-12 (median) and "
+        "{$qp/grad_rel_err_max | 1e12 * .0f}e-12 (largest).",
+        "of its 30 of the wheeled balancer {$qp/public/solved_1e9 | .0f} come out to 1e-9",
     ),
     "docs/sweeps.md": (
         "the pitch is {$s/bound_to_trot/switch_pitch_max_deg/value/0/max | .1f}° and settles in "
