@@ -22,7 +22,7 @@ from kjax.dynamics import rotations, srb_spatial
 from kjax.dynamics.srb_spatial import BodyState
 from kjax.legs import contact, lateral, spatial, swing
 from kjax.legs.base import View
-from kjax.legs.footholds import Arrival, footholds
+from kjax.legs.footholds import Arrival, footholds, turned
 from kjax.mpc import grid, momentum
 from kjax.mpc.momentum import MomentumMemory
 from kjax.spec import ControllerSpec, SpatialSpec
@@ -58,12 +58,12 @@ class _Motion(NamedTuple):
         safe = jnp.where(small, 1.0, angle)
         ahead = jnp.where(small, 1.0 - angle**2 / 6.0, jnp.sin(safe) / safe)
         across = jnp.where(small, 0.5 * angle, (1.0 - jnp.cos(safe)) / safe)
-        now = _turned(self.heading, self.velocity[:2])
+        now = turned(self.heading, self.velocity[:2])
         way = jnp.stack(
             [ahead * now[0] - across * now[1], across * now[0] + ahead * now[1]], axis=-1
         )
         heading = self.heading + angle
-        return t[..., None] * way, _turned(heading, self.velocity[:2]), heading
+        return t[..., None] * way, turned(heading, self.velocity[:2]), heading
 
 
 def start_spatial(spec: SpatialSpec, dtype: jnp.dtype) -> MomentumMemory:
@@ -177,7 +177,7 @@ def _next_motion(
     height = state.height + jnp.clip(command[HEIGHT] - state.height, -climb, climb)
     ahead = _wrapped(state.heading + reference[2] * control_dt - yaw)
     heading = _wrapped(yaw + jnp.clip(ahead, -own.heading_slack, own.heading_slack))
-    lead = velocity[:2] - _turned(heading, reference[:2])
+    lead = velocity[:2] - turned(heading, reference[:2])
     slack = params.position_slack
     lag = jnp.clip(state.lag - lead * control_dt, -slack, slack)
     return _Motion(command, reference, height, heading, lag, lead)
@@ -273,11 +273,6 @@ def _angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
             jnp.arctan2(R[1, 0], R[0, 0]),
         ]
     )
-
-
-def _turned(angle: Float[Array, "*k"], vector: Float[Array, "2"]) -> Float[Array, "*k 2"]:
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]], axis=-1)
 
 
 def _wrapped(angle: Float[Array, ""]) -> Float[Array, ""]:

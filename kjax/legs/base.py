@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kjax.legs import lateral, spatial, swing
-from kjax.legs.footholds import Arrival, footholds
+from kjax.legs.footholds import Arrival, footholds, turned
 from kjax.legs.kinematics import PlanarState, foot_jacobian, planar_state
 from kjax.legs.stance import spatial_stance_torque, stance_torque
 from kjax.types import Observation, RobotParams
@@ -253,7 +253,7 @@ def _turning_foothold(
         Arrival(
             place=body.com[None, :2] + wait[:, None] * velocity[None, :2],
             velocity=jnp.broadcast_to(velocity[:2], (4, 2)),
-            error=jnp.broadcast_to(velocity[:2], (4, 2)) - _turned(angle, footing.velocity[:2]),
+            error=jnp.broadcast_to(velocity[:2], (4, 2)) - turned(angle, footing.velocity[:2]),
             heading=jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1),
         ),
         body.rotation.T @ (body.com - body.base),
@@ -263,11 +263,6 @@ def _turning_foothold(
     )
     height = jnp.full_like(place[:, :1], footing.ground + robot.foot_radius)
     return jnp.concatenate([place, height], axis=1)
-
-
-def _turned(angle: Float[Array, "4"], vector: Float[Array, "2"]) -> Float[Array, "4 2"]:
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]], axis=-1)
 
 
 def _spatial_joints(
@@ -281,14 +276,8 @@ def _spatial_joints(
     """All joints press with the planned forces, or follow the path of a swing."""
     body = view.whole
     assert body is not None  # _free_view made it
-    angle, rate = swing.spatial_joint_reference(robot, body, command.foot, command.foot_vel)
-    follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
     press = spatial_stance_torque(robot, body.hip, body.planar.trig, command.force @ body.rotation)
-    # A sideways force has nothing to push against before the foot is down: keep the leg upright.
-    loose = command.stance & ~observation.contact
-    tracks = jnp.broadcast_to(~command.stance[:, None], press.shape)
-    tracks = tracks.at[:, 0].set(~command.stance | loose)
-    return JointTargets(jnp.where(tracks, follow, press), angle, rate, tracks)
+    return _press_or_follow(robot, settings, body, command, observation, press)
 
 
 def _free_joints(
@@ -302,13 +291,25 @@ def _free_joints(
     """All joints press with the regulated forces, or follow the path of a swing."""
     body = view.whole
     assert body is not None  # _free_view made it
-    angle, rate = swing.spatial_joint_reference(robot, body, command.foot, command.foot_vel)
-    follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
     force = lateral.stance_forces(sideways, robot, body, command.stance, command.force)
     press = spatial_stance_torque(robot, body.hip, body.planar.trig, force)
     # The regulator has changed the plan's forces: the limits of its rows hold for these as well.
     load = jnp.max(jnp.abs(press) / robot.torque_limit, axis=1, keepdims=True)
     press = press * jnp.minimum(1.0, sideways.torque_fraction / jnp.maximum(load, 1e-6))
+    return _press_or_follow(robot, settings, body, command, observation, press)
+
+
+def _press_or_follow(
+    robot: RobotParams,
+    settings: swing.SwingParams,
+    body: spatial.SpatialState,
+    command: LegCommand,
+    observation: Observation,
+    press: Float[Array, "4 3"],
+) -> JointTargets:
+    """Torques ``press`` [N m] of the legs that stand, the path of a swing for the others."""
+    angle, rate = swing.spatial_joint_reference(robot, body, command.foot, command.foot_vel)
+    follow = swing.swing_torque(settings, observation.joint_pos, observation.joint_vel, angle, rate)
     # A sideways force has nothing to push against before the foot is down: keep the leg upright.
     loose = command.stance & ~observation.contact
     tracks = jnp.broadcast_to(~command.stance[:, None], press.shape)

@@ -57,6 +57,12 @@ def footholds(
     return body.place + lever + way + correction
 
 
+def turned(angle: Float[Array, "*k"], vector: Float[Array, "2"]) -> Float[Array, "*k 2"]:
+    """A horizontal vector turned to the left by each angle [rad]."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]], axis=-1)
+
+
 def _rotate(heading: Float[Array, "4 2"], vector: Float[Array, "4 2"]) -> Float[Array, "4 2"]:
     c, s = heading[:, 0], heading[:, 1]
     x, y = vector[:, 0], vector[:, 1]
