@@ -24,10 +24,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax.qp.batching import where_needed, while_any
+from kjax.qp.lapack import cholesky, cholesky_solve, inverse_of_lower
 from kjax.qp.row_problem import RowProblem
 
 ROUNDS = 3  # of steps 2 to 5; one is usual
@@ -84,15 +84,46 @@ class _Sizes(NamedTuple):
     outside: Array
 
 
-def solve_active_set(
-    problem: RowProblem, good: Array, tolerance: float, max_iterations: int
-) -> tuple[ActiveSet, Bool[Array, ""]]:
-    """The last iterate, and whether H is positive definite to working precision.
+class Factor(NamedTuple):
+    """H in triangles, L L^T = H / curvature.
 
-    Where it is not, or the problem is not ``good``, nothing is done.
+    Attributes:
+      L: (n, n) lower triangle; the identity where H is not definite.
+      curvature: largest of H's diagonal.
+      definite: whether H is positive definite to working precision.
+    """
+
+    L: Float[Array, "n n"]
+    curvature: Float[Array, ""]
+    definite: Bool[Array, ""]
+
+
+def factorise(problem: RowProblem) -> Factor:
+    """Cholesky factor of the problem's H."""
+    n, dtype = problem.q.shape[0], problem.q.dtype
+    eps = float(jnp.finfo(dtype).eps)
+    curvature = jnp.max(jnp.diagonal(problem.H))
+    curvature = jnp.where(curvature > 0, curvature, 1.0)
+    L = cholesky(problem.H / curvature)
+    definite = (jnp.diagonal(L) > (n * eps) ** 0.5).all()
+    return Factor(jnp.where(definite, L, jnp.eye(n, dtype=dtype)), curvature, definite)
+
+
+def unconstrained(problem: RowProblem, factor: Factor) -> Float[Array, "n"]:
+    """Minimiser (n,) without any rows."""
+    return -cholesky_solve(factor.L, problem.q) / factor.curvature
+
+
+def solve_active_set(
+    problem: RowProblem, factor: Factor, good: Array, tolerance: float, max_iterations: int
+) -> ActiveSet:
+    """The last iterate.
+
+    Where H is not definite, or the problem is not ``good``, nothing is done.
 
     Args:
       problem: scaled.
+      factor: of its H.
       good: whether it is worth it.
       tolerance: violation of a row, relative, that is none [-].
       max_iterations: limit on rows added and dropped.
@@ -100,14 +131,9 @@ def solve_active_set(
     n, dtype = problem.q.shape[0], problem.q.dtype
     M = problem.low.shape[0]
     eps = float(jnp.finfo(dtype).eps)
-    curvature = jnp.max(jnp.diagonal(problem.H))
-    curvature = jnp.where(curvature > 0, curvature, 1.0)
-    factor = jnp.linalg.cholesky(problem.H / curvature)
-    definite = (jnp.diagonal(factor) > (n * eps) ** 0.5).all()
-    factor = jnp.where(definite, factor, jnp.eye(n, dtype=dtype))
     # An inverse, not solves: products are what XLA does fast.
-    half = solve_triangular(factor, jnp.eye(n, dtype=dtype), lower=True)
-    inverse = half.T @ half / curvature
+    half = inverse_of_lower(factor.L)
+    inverse = half.T @ half / factor.curvature
     zero = jnp.zeros((), jnp.int32)
     state = ActiveSet(  # step 1
         stack=jnp.concatenate([inverse, jnp.zeros((M, n), dtype)]),
@@ -116,7 +142,7 @@ def solve_active_set(
         bound_status=jnp.zeros((M,), dtype),
         chosen=zero,
         sign=jnp.ones((), dtype),
-        pending=good & definite,
+        pending=good & factor.definite,
         infeasible=jnp.zeros((), bool),
         rounds=zero,
         iterations=zero,
@@ -130,10 +156,9 @@ def solve_active_set(
     rounding = max(10.0 * eps, min(30.0 * n * eps, 1e-11))
     sizes = _Sizes(
         flat=rounding * jnp.max(jnp.diagonal(inverse)),
-        outside=jnp.max(jnp.abs(problem.q)) / curvature,
+        outside=jnp.max(jnp.abs(problem.q)) / factor.curvature,
     )
-    state = while_any(lambda state: state.pending, partial(_round, settings), state, problem, sizes)
-    return state, definite
+    return while_any(lambda state: state.pending, partial(_round, settings), state, problem, sizes)
 
 
 def farkas(problem: RowProblem, state: ActiveSet) -> Float[Array, "M"]:

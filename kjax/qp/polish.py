@@ -5,9 +5,9 @@ r"""The equations that the active rows make: a method's point brought to roundin
 """
 
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from kjax.qp.lapack import cholesky, inverse_of_lower
 from kjax.qp.row_problem import RowProblem
 
 
@@ -50,8 +50,7 @@ def solve_equations(
     H, r_dual = H / h, r_dual / h
     rho = eps**-0.5
     ridge = 10.0 * n * eps
-    factor = jnp.linalg.cholesky(H + rho * A.T @ A + ridge * jnp.eye(n, dtype=H.dtype))
-    half = solve_triangular(factor, jnp.eye(n, dtype=H.dtype), lower=True)
+    half = inverse_of_lower(cholesky(H + rho * A.T @ A + ridge * jnp.eye(n, dtype=H.dtype)))
     dx, dy = jnp.zeros_like(r_dual), jnp.zeros_like(r_primal)
     for _ in range(4):
         missing = A @ dx - r_primal

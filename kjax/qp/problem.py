@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax.precision import full_precision
+from kjax.qp.lapack import cholesky, inverse_of_lower
 
 
 class Status(IntEnum):
@@ -168,7 +168,7 @@ def prepare(H: Float[Array, "n n"], fixed: Bool[Array, "n"] | None = None) -> Pr
     # By Cholesky, which costs a tenth of the spectrum that only the first-order methods need. The
     # trace of H^-1 is 1/eig_min to n/eig_min, and |H| is no less than eig_max.
     eps = float(jnp.finfo(H.dtype).eps)
-    half = solve_triangular(jnp.linalg.cholesky(constant), jnp.eye(n, dtype=H.dtype), lower=True)
+    half = inverse_of_lower(cholesky(constant))
     definite = positive & (n * eps * jnp.linalg.norm(constant) * jnp.sum(half**2) < 1.0)
     stand_in = jnp.where(definite, constant, jnp.eye(n, dtype=H.dtype))
     eigenvalues, vectors = jnp.linalg.eigh(constant)
@@ -199,11 +199,10 @@ def start(prepared: Prepared) -> Warm:
 
 def swept(H: Float[Array, "n n"], free: Bool[Array, "n"]) -> Float[Array, "n n"]:
     """Tableau of H swept on the free variables, from scratch; see ``qp.tableau``."""
-    n = H.shape[-1]
     both, neither = (jnp.outer(a, a).astype(H.dtype) for a in (free, ~free))
     # Bound variables get a unit diagonal of their own, so that one factorisation does for all.
-    factor = jnp.linalg.cholesky(H * both + jnp.diag((~free).astype(H.dtype)))
-    half = solve_triangular(factor, jnp.eye(n, dtype=H.dtype), lower=True)
+    factor = cholesky(H * both + jnp.diag((~free).astype(H.dtype)))
+    half = inverse_of_lower(factor)
     inverse = both * (half.T @ half)
     right = inverse @ H
     cross = jnp.outer(free, ~free).astype(H.dtype) * right

@@ -11,10 +11,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from kjax.qp.active_set import ActiveSet, farkas, solve_active_set
+from kjax.qp.active_set import (
+    ActiveSet,
+    Factor,
+    factorise,
+    farkas,
+    solve_active_set,
+    unconstrained,
+)
 from kjax.qp.batching import where_needed
 from kjax.qp.certificates import Verdict, classify, proves_infeasible
 from kjax.qp.interior import solve_interior_point
+from kjax.qp.lapack import cholesky
 from kjax.qp.polish import polish
 from kjax.qp.row_problem import (
     RowData,
@@ -120,12 +128,26 @@ def pose(data: RowData, good: Array, *, equilibrate: bool = True) -> Posed:
     return Posed(problem, scaling, data, good)
 
 
-def by_active_set(settings: RowSettings, posed: Posed) -> tuple[Found, Evidence]:
-    """Dual active set; H must be positive definite. ``infeasible`` is claimed, not yet proven."""
-    state, definite = solve_active_set(
-        posed.problem, posed.good, 0.1 * settings.tolerance, settings.max_iterations
+def without_rows(posed: Posed) -> tuple[Found, Factor]:
+    """The unconstrained minimiser, often the solution; and the factor of H."""
+    factor = factorise(posed.problem)
+    x = unconstrained(posed.problem, factor)
+    found = Found(
+        *_judge_inside(posed, x, jnp.zeros_like(posed.problem.low)),
+        usable=factor.definite | ~posed.good,
+        infeasible=jnp.zeros((), bool),
+        iterations=jnp.zeros((), jnp.int32),
+        method=_used(MethodUsed.ACTIVE_SET),
     )
-    usable = definite | ~posed.good
+    return found, factor
+
+
+def by_active_set(settings: RowSettings, posed: Posed, factor: Factor) -> tuple[Found, Evidence]:
+    """Dual active set; H must be positive definite. ``infeasible`` is claimed, not yet proven."""
+    state = solve_active_set(
+        posed.problem, factor, posed.good, 0.1 * settings.tolerance, settings.max_iterations
+    )
+    usable = factor.definite | ~posed.good
     at_low, at_high = state.bound_status > 0, state.bound_status < 0
     found = Found(
         *_judge(posed, state.x, state.multipliers, at_low, at_high),
@@ -217,7 +239,7 @@ def _semidefinite(problem: RowProblem) -> Array:
     size = jnp.max(jnp.abs(problem.H), initial=0.0)
     H = problem.H / jnp.where(size > 0, size, 1.0)
     ridge = 10.0 * n * eps * jnp.eye(n, dtype=H.dtype)
-    return jnp.isfinite(jnp.linalg.cholesky(H + ridge)).all()
+    return jnp.isfinite(cholesky(H + ridge)).all()
 
 
 def _used(method: MethodUsed) -> Array:

@@ -6,8 +6,9 @@
 H free to change from call to call: nothing is prepared.
 
 1. Scale; a row that no free variable can move is judged by its constant side.
-2. Solve by the method. ``"auto"`` takes the active set, and the interior point where H is not
-   positive definite (or rounding has defeated the active set).
+2. Solve by the method. The active set comes after the unconstrained minimiser, where that breaks
+   a row. ``"auto"`` takes it, and the interior point where H is not positive definite (or rounding
+   has defeated the active set).
 3. Judge the point as it is returned, clipped, in the caller's units (``kkt_errors``).
 4. What is not solved may be proven infeasible or unbounded (``qp.certificates``).
 
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from kjax.precision import full_precision
+from kjax.qp.active_set import Factor
 from kjax.qp.batching import where_needed
 from kjax.qp.certificates import Verdict
 from kjax.qp.polish import solve_equations
@@ -33,6 +35,7 @@ from kjax.qp.row_methods import (
     ROW_METHODS,
     Evidence,
     Found,
+    Posed,
     RowMethod,
     RowSettings,
     better_by_interior_point,
@@ -42,6 +45,7 @@ from kjax.qp.row_methods import (
     classified,
     pose,
     proven_by_active_set,
+    without_rows,
 )
 from kjax.qp.row_problem import RowData
 
@@ -174,23 +178,20 @@ def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
     # step 1; the active set wants curvature everywhere, and needs no other units then
     by_curvature = settings.method in ("auto", "active_set")
     posed = pose(data, good, equilibrate=not by_curvature)
-    evidence = None
     if settings.method == "interior_point":  # steps 2 and 3
-        found = by_interior_point(settings, posed)
+        found, more, args = by_interior_point(settings, posed), _unsolved, ()
     elif settings.method == "admm":
-        found = by_splitting(settings, posed, warm)
+        found, more, args = by_splitting(settings, posed, warm), _unsolved, ()
     else:
-        found, evidence = by_active_set(settings, posed)
+        found, factor = without_rows(posed)
+        more, args = _constrained, (posed, factor)
     # One branch for all that an unsolved problem needs: each costs a call more than a microsecond.
-    solved_at_once = found.usable & found.solved(settings.tolerance)
     verdict = Verdict(jnp.zeros((), bool), jnp.zeros((), bool), found.x)
     found, verdict = where_needed(
-        posed.good & ~solved_at_once,
-        partial(_unsolved, settings),
+        _unfinished(settings, found, posed.good),
+        partial(more, settings),
         (found, verdict),
-        posed.data,
-        posed.good,
-        evidence,
+        *(args or (posed.data, posed.good)),
     )
     status = jnp.select(
         [
@@ -253,12 +254,32 @@ def _inside(x: Array, qp: _Qp, consistent: Array) -> Array:
     return jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), inside, outside)
 
 
+def _unfinished(settings: RowSettings, found: Found, good: Array) -> Array:
+    """Whether a good problem has no solution yet."""
+    return good & ~(found.usable & found.solved(settings.tolerance))
+
+
+def _constrained(
+    settings: RowSettings, old: tuple[Found, Verdict], posed: Posed, factor: Factor
+) -> tuple[Found, Verdict]:
+    """The active set, for what the unconstrained minimiser does not solve."""
+    found, evidence = by_active_set(settings, posed, factor)
+    return where_needed(
+        _unfinished(settings, found, posed.good),
+        partial(_unsolved, settings),
+        (found, old[1]._replace(x=found.x)),
+        posed.data,
+        posed.good,
+        evidence,
+    )
+
+
 def _unsolved(
     settings: RowSettings,
     old: tuple[Found, Verdict],
     data: RowData,
     good: Array,
-    evidence: Evidence | None,
+    evidence: Evidence | None = None,
 ) -> tuple[Found, Verdict]:
     """Another method for what ``"auto"`` has not solved, then step 4."""
     found, verdict = old

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax.qp.certificates import is_descent, proves_infeasible
+from kjax.qp.lapack import cholesky, inverse_of_lower
 from kjax.qp.polish import polish
 from kjax.qp.row_problem import RowProblem
 
@@ -139,7 +139,7 @@ def _iterate(rows: _Rows, state: _State, steps: Array) -> tuple[Array, ...]:
     n, dtype = problem.q.shape[0], problem.q.dtype
     rho = state.rho * weight
     K = problem.H + SIGMA * jnp.eye(n, dtype=dtype) + problem.gram(rho)  # step 1
-    half = solve_triangular(jnp.linalg.cholesky(K), jnp.eye(n, dtype=dtype), lower=True)
+    half = inverse_of_lower(cholesky(K))
 
     def step(_: Any, carry: Any) -> Any:  # step 2
         x, v, y, _, _ = carry
