@@ -12,23 +12,27 @@ from kjax.config.checks import STRICT, Count, NonNegative, Positive
 class TerrainConfig:
     """Obstacles on the way."""
 
-    kind: Literal["flat", "paper", "blocks", "steps", "slope", "patches"] = "flat"
+    kind: Literal[
+        "flat", "paper", "blocks", "steps", "slope", "cross_slope", "tiles", "patches"
+    ] = "flat"
     """None; the paper's blocks, cubes and capsules; or one of ours [-]."""
     seed: int = 0
     """Seed of the field; independent of the noise's [-]."""
     count: Count = 8
-    """Number of obstacles, steps or patches [-]."""
+    """Number of obstacles, steps, patches, or tiles along the way [-]."""
     start: Positive = 0.8
     """Where the field begins, measured from the robot's start [m]."""
     end: Positive = 2.6
     """Its far end [m]."""
     height_min: Positive = 0.05
-    """Lowest obstacle, or rise of a step [m]."""
+    """Lowest obstacle or tile, or rise of a step [m]."""
     height_max: Positive = 0.07
-    """Highest obstacle, or rise of a step [m]."""
+    """Highest obstacle or tile, or rise of a step [m]."""
+    width: Positive = 0.8
+    """Width of what reaches across both tracks [m]."""
     slope: Annotated[float, Field(gt=-45, lt=45)] = 8.0
-    """Inclination of a slope; below 0 it leads down first, from a platform and up to another
-    [deg]."""
+    """Inclination of a slope; below 0 it leads down first, from a platform and up to another. Of
+    one across the way, rising to the left, or to the right below 0 [deg]."""
     patch_friction: Positive = 0.3
     """Friction of a foot on a patch [-]."""
 

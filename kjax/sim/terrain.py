@@ -14,7 +14,7 @@ from kjax.types import RobotParams
 
 _BOX, _CAPSULE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
 PREFIX = "obstacle_"
-_WIDE = 0.4  # m, half-width of what reaches across both tracks
+_ROWS = 6  # tiles beside each other
 _PLATFORM = 5.0  # m, half-length of what a slope downwards starts from and ends at
 _ACROSS = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # turns a capsule's axis along y
 
@@ -24,14 +24,15 @@ class Field:
     """An obstacle field, measured from where the robot starts.
 
     Attributes:
-      kind: "flat", "paper", "blocks", "steps", "slope" or "patches", see ``generate``.
+      kind: see ``generate``.
       seed: of where the obstacles lie.
       count: number of obstacles, steps or patches.
       start: where the field begins [m].
       end: its far end [m].
       height_min: lowest obstacle, or rise of a step [m].
       height_max: highest obstacle, or rise of a step [m].
-      slope: inclination of a slope; below 0 it leads down first [deg].
+      width: of what reaches across both tracks [m].
+      slope: inclination of a slope; below 0 it leads down first, or rises to the right [deg].
       patch_friction: sliding friction of a foot on a patch [-].
       friction: that on all else [-].
       track: half the distance between the left and the right feet [m].
@@ -44,6 +45,7 @@ class Field:
     end: float
     height_min: float
     height_max: float
+    width: float
     slope: float
     patch_friction: float
     friction: float
@@ -77,6 +79,10 @@ def shapes(kind: str, count: int) -> list[mujoco.mjtGeom]:
         return []
     if kind == "slope":
         return [_BOX] * 4
+    if kind == "cross_slope":
+        return [_BOX] * 3
+    if kind == "tiles":
+        return [_BOX] * (count * _ROWS)
     if kind == "paper":
         return [_CAPSULE if i % 3 == 2 else _BOX for i in range(count)]
     return [_BOX] * count
@@ -87,7 +93,9 @@ def generate(field: Field) -> Terrain:
 
     Kinds: ``paper`` (blocks, cubes and capsules alternating, on the left track, the right one or
     both), ``blocks`` (random blocks on both tracks), ``steps`` (a flight of steps up, then down),
-    ``slope`` (up, level, down; or down, level, up), ``patches`` (level, slippery plates).
+    ``slope`` (up, level, down; or down, level, up), ``cross_slope`` (ground that rises to the left
+    or right of the way), ``tiles`` (square ones of random heights, six rows of them),
+    ``patches`` (level, slippery plates).
     """
     rng = np.random.default_rng([field.seed, 7])
     make = {
@@ -96,6 +104,8 @@ def generate(field: Field) -> Terrain:
         "blocks": _blocks,
         "steps": _steps,
         "slope": _slope,
+        "cross_slope": _cross_slope,
+        "tiles": _tiles,
         "patches": _patches,
     }[field.kind]
     pos, quat, size = make(field, rng)
@@ -175,12 +185,12 @@ def _paper(field: Field, rng: np.random.Generator) -> _Boxes:
         yaw = rng.uniform(-1.0, 1.0)
         y, q = float(side * field.track), _ACROSS
         if i % 3 == 0:  # block
-            half = [rng.uniform(0.06, 0.12), 0.12 if side else _WIDE, h / 2]
+            half = [rng.uniform(0.06, 0.12), 0.12 if side else field.width / 2, h / 2]
             q = _yaw(0.4 * yaw if side else 0.0)
         elif i % 3 == 1:  # cube, always under one track
             half, y, q = [h / 2] * 3, float((side or 1) * field.track), _yaw(0.7 * yaw)
         else:  # capsule, lying across
-            half = [h / 2, 0.15 if side else _WIDE, 0.0]
+            half = [h / 2, 0.15 if side else field.width / 2, 0.0]
         pos.append([x, y, h / 2])
         quat.append(q)
         size.append(half)
@@ -192,7 +202,7 @@ def _blocks(field: Field, rng: np.random.Generator) -> _Boxes:
     h = rng.uniform(field.height_min, field.height_max, field.count)
     side = rng.integers(-1, 2, field.count)
     length = rng.uniform(0.05, 0.15, field.count)
-    size = np.stack([length, np.where(side == 0, _WIDE, 0.12), h / 2], axis=-1)
+    size = np.stack([length, np.where(side == 0, field.width / 2, 0.12), h / 2], axis=-1)
     yaw = np.where(side == 0, 0.0, rng.uniform(-0.4, 0.4, field.count))
     pos = np.stack([x, side * field.track, h / 2], axis=-1)
     return pos, np.array([_yaw(a) for a in yaw]), size
@@ -207,12 +217,16 @@ def _steps(field: Field, rng: np.random.Generator) -> _Boxes:
     tread = (field.end - field.start) / count
     x = field.start + tread * (np.arange(count) + 0.5)
     pos = np.stack([x, np.zeros(count), level / 2], axis=-1)
-    size = np.stack([np.full(count, tread / 2), np.full(count, _WIDE), level / 2], axis=-1)
+    size = np.stack(
+        [np.full(count, tread / 2), np.full(count, field.width / 2), level / 2], axis=-1
+    )
     return pos, np.tile(_yaw(0.0), (count, 1)), size
 
 
 def ground_level(field: Field) -> float:
     """Height of the plane that the obstacles lie on, from where the robot starts [m]."""
+    if field.kind == "cross_slope":
+        return -0.5 * field.width * abs(np.tan(np.radians(field.slope)))
     if field.kind != "slope" or field.slope > 0:
         return 0.0
     return (field.end - field.start) / 3.0 * np.tan(np.radians(field.slope))
@@ -230,7 +244,7 @@ def _slope(field: Field, rng: np.random.Generator) -> _Boxes:
         normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
         pos.append(np.array([centre, 0.0, height]) - thick * normal)
         quat.append([np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0])
-        size.append([half, _WIDE, thick])
+        size.append([half, field.width / 2, thick])
 
     first, last = field.start + 0.5 * third, field.end - 0.5 * third
     add(first, top / 2, -angle, ramp)
@@ -244,12 +258,42 @@ def _slope(field: Field, rng: np.random.Generator) -> _Boxes:
     return np.array(pos), np.array(quat), np.array(size)
 
 
+def _cross_slope(field: Field, rng: np.random.Generator) -> _Boxes:
+    """Ground that is tilted about the way, between two level platforms."""
+    angle, thick = np.radians(field.slope), 0.05
+    middle, half = 0.5 * (field.start + field.end), 0.5 * (field.end - field.start)
+    normal = np.array([0.0, -np.sin(angle), np.cos(angle)])
+    pos = np.array(
+        [
+            np.array([middle, 0.0, 0.0]) - thick * normal,
+            [field.start - _PLATFORM, 0.0, -thick],
+            [field.end + _PLATFORM, 0.0, -thick],
+        ]
+    )
+    tilted = [np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]
+    across = field.width / 2
+    size = [[half, across / np.cos(angle), thick], *[[_PLATFORM, across, thick]] * 2]
+    return pos, np.array([tilted, _yaw(0.0), _yaw(0.0)]), np.array(size)
+
+
+def _tiles(field: Field, rng: np.random.Generator) -> _Boxes:
+    """A height field of one height per tile."""
+    length, across = (field.end - field.start) / field.count, field.width / _ROWS
+    row, column = np.divmod(np.arange(field.count * _ROWS), _ROWS)
+    h = rng.uniform(field.height_min, field.height_max, field.count * _ROWS)
+    x = field.start + length * (row + 0.5)
+    y = across * (column + 0.5) - field.width / 2
+    pos = np.stack([x, y, h / 2], axis=-1)
+    size = np.stack([np.full_like(h, length / 2), np.full_like(h, across / 2), h / 2], axis=-1)
+    return pos, np.tile(_yaw(0.0), (len(h), 1)), size
+
+
 def _patches(field: Field, rng: np.random.Generator) -> _Boxes:
     x = _spread(field, rng)
     half = 0.4 * (field.end - field.start) / field.count
     thick = 0.001
     pos = np.stack([x, np.zeros(field.count), np.full(field.count, thick / 2)], axis=-1)
-    size = np.tile([half, _WIDE, thick / 2], (field.count, 1))
+    size = np.tile([half, field.width / 2, thick / 2], (field.count, 1))
     return pos, np.tile(_yaw(0.0), (field.count, 1)), size
 
 

@@ -21,7 +21,7 @@ from kjax.sim.resolve import (
 )
 from kjax.sim.scene import apply_world, build_spec
 
-KINDS = ("paper", "blocks", "steps", "slope", "patches")
+KINDS = ("paper", "blocks", "steps", "slope", "cross_slope", "tiles", "patches")
 
 
 def top(field, shape):
@@ -63,7 +63,7 @@ def test_a_seed_gives_its_field_again_and_another_seed_another(kind):
     for a, b in zip(make(3), make(3), strict=True):
         np.testing.assert_array_equal(a, b)
     different = any((a != b).any() for a, b in zip(make(3), make(4), strict=True))
-    assert different == (kind != "slope")  # a slope has nothing random in it
+    assert different == ("slope" not in kind)  # a slope has nothing random in it
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -85,6 +85,7 @@ def test_moving_the_obstacles_equals_compiling_the_other_field(kind):
     for geom in spec.geoms:
         if geom.name in go1.ROBOT.feet:
             geom.friction[0] = 0.8
+    next(geom for geom in spec.geoms if geom.name == "ground").pos[2] = resolve_world(second).ground
     compiled = spec.compile()
     for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_rbound"):
         np.testing.assert_allclose(getattr(placed, name), getattr(compiled, name), atol=1e-12)
@@ -106,6 +107,43 @@ def test_a_field_of_another_size_is_refused():
     )
     with pytest.raises(ValueError, match="4 obstacles, the scene holds 8"):
         terrain.place(model, made(kind="slope"))
+
+
+def ground_height(config, **sim):
+    """Height of what lies at (x, y), by a ray of MuJoCo from above."""
+    model = build_scene(RunConfig(sim=SimConfig(base="planar", **sim), terrain=config))
+    data = mujoco.MjData(model)
+    data.qpos[1] = 5.0  # the robot out of the way
+    mujoco.mj_forward(model, data)
+
+    def height(x, y):
+        geom, down = np.zeros(1, np.int32), np.array([0.0, 0.0, -1.0])
+        ray = mujoco.mj_ray(model, data, np.array([x, y, 3.0]), down, None, 1, -1, geom, None)
+        return 3.0 - ray
+
+    return height
+
+
+@pytest.mark.parametrize("angle", [15.0, -20.0])
+def test_a_slope_across_the_way_rises_to_the_side(angle):
+    height = ground_height(TerrainConfig(kind="cross_slope", slope=angle, width=1.2))
+    rise = np.tan(np.radians(angle))
+    for x in (0.85, 1.7, 2.55):
+        for y in (-0.5, 0.0, 0.13, 0.5):
+            assert height(x, y) == pytest.approx(y * rise, abs=1e-6)
+    for x in (-1.0, 0.75, 2.65, 5.0):
+        assert height(x, 0.3) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_tiles_cover_the_field_with_heights_in_range():
+    config = TerrainConfig(kind="tiles", count=5, height_min=0.02, height_max=0.06, width=1.2)
+    height = ground_height(config)
+    x = np.linspace(0.81, 2.59, 30)
+    seen = np.array([[height(a, b) for b in np.linspace(-0.59, 0.59, 30)] for a in x])
+    assert seen.min() >= 0.02 - 1e-9
+    assert seen.max() <= 0.06 + 1e-9
+    assert len(np.unique(seen.round(9))) == 30
+    assert height(0.79, 0.0) == height(2.61, 0.0) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_slope_rises_at_its_angle_and_meets_the_plateau():
