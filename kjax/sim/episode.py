@@ -141,6 +141,8 @@ class Goal(NamedTuple):
       command: what is asked over time.
       gait_times: (K,) when each gait is asked for [s].
       heights: (G,) of the centre of mass in each gait, above the ground [m].
+      slews: (2,) rates at which the references of velocity and yaw rate follow the command
+        [m/s^2, rad/s^2].
       field: (2,) where the obstacles begin and end, from the robot's start [m].
     """
 
@@ -149,6 +151,7 @@ class Goal(NamedTuple):
     command: Command
     gait_times: np.ndarray
     heights: np.ndarray
+    slews: np.ndarray
     field: tuple[float, float]
 
 

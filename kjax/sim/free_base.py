@@ -101,6 +101,28 @@ def metrics(
     }
 
 
+def path_errors(qpos: np.ndarray, reference: np.ndarray, dt: float) -> dict[str, float]:
+    """Largest distance of the trunk from where, and turn from how, its references would take it.
+
+    Args:
+      qpos: (N, nq) of an episode from its start; a planar one gives nothing.
+      reference: (N, 3) v_x, v_y [m/s] and yaw rate [rad/s].
+      dt: time between two samples [s].
+    """
+    if not is_free(qpos):
+        return {}
+    yaw = np.unwrap(attitude(qpos)[2])
+    heading = yaw[0] + dt * np.append(0.0, np.cumsum(reference[:-1, 2]))
+    c, s = np.cos(heading), np.sin(heading)
+    v_x, v_y = reference[:, 0], reference[:, 1]
+    step = dt * np.stack([c * v_x - s * v_y, s * v_x + c * v_y], axis=-1)
+    place = qpos[0, :2] + np.cumsum(np.concatenate([np.zeros((1, 2)), step[:-1]]), axis=0)
+    return {
+        "path_error_max_m": float(np.linalg.norm(qpos[:, :2] - place, axis=1).max()),
+        "heading_error_max_deg": float(np.degrees(np.abs(yaw - heading)).max()),
+    }
+
+
 def sliding_speed(
     robot: RobotParams,
     quat: np.ndarray,

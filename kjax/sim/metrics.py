@@ -31,6 +31,27 @@ def reference_height(
     return goal.heights[gait] + _asked(time, goal, "height")[:, 0]
 
 
+def reference_velocity(time: Float[np.ndarray, "N"], goal: Goal) -> Float[np.ndarray, "N 3"]:
+    """References of v_x, v_y [m/s] and yaw rate [rad/s]: the command at bounded rates.
+
+    Args:
+      time: (N,) since the start [s].
+      goal: of the episode.
+    """
+    columns = [COMMAND_NAMES.index(name) for name in ("v_x", "v_y", "yaw_rate")]
+    wanted = np.asarray(goal.command.values)[:, columns]
+    begin = np.asarray(goal.command.times, float)
+    rates = goal.slews[[0, 0, 1]]
+    out, before = np.zeros((len(time), 3)), np.zeros(3)
+    for piece, (start, end) in enumerate(zip(begin, [*begin[1:], np.inf], strict=True)):
+        inside = (time >= start - 1e-9) & (time < end - 1e-9)
+        change, passed = wanted[piece] - before, time[inside, None] - start
+        out[inside] = before + np.clip(change, -rates * passed, rates * passed)
+        if np.isfinite(end):
+            before = before + np.clip(change, -rates * (end - start), rates * (end - start))
+    return out
+
+
 def _asked(time: Float[np.ndarray, "N"], goal: Goal, *names: str) -> Float[np.ndarray, "N k"]:
     """Columns of the command at some times."""
     piece = np.searchsorted(goal.command.times, time + 1e-9, side="right") - 1
@@ -83,6 +104,7 @@ def metrics(run: Trajectory, goal: Goal, stats: TickStats | None = None) -> dict
         **_crossing(run, goal),
         **_switching(run, goal),
         **free_base.metrics(run.qpos, run.qvel, _asked(run.time, goal, "v_y", "yaw_rate"), steady),
+        **free_base.path_errors(run.qpos, reference_velocity(run.time, goal), run.dt),
         "foot_slip_m": float(stats.slip.sum() / _stances(run)),
         "torque_max_nm": float(stats.torque.max()),
         "torque_saturation_fraction": float(stats.saturated.sum() / stats.steps.sum()),
@@ -135,7 +157,7 @@ def metric_names(goal: Goal) -> set[str]:
     if goal.scene.base == "free":
         names |= {
             "roll_max_deg", "roll_p95_deg", "yaw_max_deg", "velocity_y_rmse_mps",
-            "yaw_rate_rmse_radps", "lateral_drift_m",
+            "yaw_rate_rmse_radps", "lateral_drift_m", "path_error_max_m", "heading_error_max_deg",
         }  # fmt: skip
     return names
 

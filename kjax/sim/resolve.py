@@ -125,6 +125,7 @@ def _goal(config: RunConfig, scene: SceneSpec) -> Goal:
         command=build_command(config.command),
         gait_times=np.asarray(config.gait.times, float),
         heights=np.array(heights, float),
+        slews=np.array([si.lmpc.command_slew, si.spatial.yaw_slew], float),
         field=(terrain.start, terrain.end),
     )
 

@@ -42,6 +42,8 @@ TABLE = (
     ("yaw_max_deg", "yaw, largest [deg]", ".2f"),
     ("velocity_y_rmse_mps", "RMSE of the sideways velocity [m/s]", ".4f"),
     ("yaw_rate_rmse_radps", "RMSE of the yaw rate [rad/s]", ".4f"),
+    ("path_error_max_m", "distance from the path asked for, largest [m]", ".3f"),
+    ("heading_error_max_deg", "error of the heading, largest [deg]", ".2f"),
     ("lateral_drift_m", "sideways drift, largest [m]", ".3f"),
     ("height_mean_m", "CoM height, mean [m]", ".3f"),
     ("height_error_max_m", "CoM height, largest error [m]", ".3f"),

@@ -13,7 +13,7 @@ from kjax.robots import go1
 from kjax.sim import free_base
 from kjax.sim.engines import mjx as mjx_engine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
-from kjax.sim.metrics import foot_slip, metrics
+from kjax.sim.metrics import foot_slip, metrics, reference_velocity
 from kjax.sim.noise import FREE_NOISE_DIM, add_noise, sensor_noise
 from kjax.sim.observe import build_observe
 from kjax.sim.resolve import (
@@ -21,6 +21,7 @@ from kjax.sim.resolve import (
     build_scene,
     resolve_episode,
     resolve_episodes,
+    resolve_goal,
     resolve_scene,
     start_state,
 )
@@ -175,6 +176,39 @@ def test_metrics_measure_yaw_and_drift_from_the_first_heading():
     assert result["lateral_drift_m"] == pytest.approx(0.3)
     planar = np.zeros((steps, 15))
     assert free_base.metrics(planar, planar, wanted, np.ones(steps, bool)) == {}
+
+
+def test_a_path_is_compared_with_the_command_at_its_rates():
+    goal = resolve_goal(
+        load_config(
+            RunConfig, None,
+            {
+                "controller": "spatial", "sim.base": "free",
+                "command.times": [0.0, 1.0, 2.0], "command.v_x": [0.0, 0.5, 0.5],
+                "command.yaw_rate": [0.0, 0.0, 0.8],
+                "lmpc.command_slew": 2.0, "spatial.yaw_slew": 4.0,
+            },
+        )
+    )  # fmt: skip
+    time = np.arange(0.0, 4.0, 0.001)
+    wanted = reference_velocity(time, goal)
+    speed = np.interp(time, [1.0, 1.25], [0.0, 0.5])
+    np.testing.assert_allclose(wanted[:, 0], speed, atol=1e-9)
+    assert not wanted[:, 1].any()
+    turning = np.interp(time, [2.0, 2.2], [0.0, 0.8])
+    np.testing.assert_allclose(wanted[:, 2], turning, atol=1e-9)
+    qpos, first = np.zeros((len(time), 19)), 2.0
+    heading = first + np.append(0.0, np.cumsum(turning[:-1])) * 0.001
+    late = 0.1 * (time > 3.0)  # rad, and it is 30 mm to the left of where it should be
+    for row, yaw in zip(qpos, heading + late, strict=True):
+        mujoco.mju_euler2Quat(row[3:7], np.array([yaw, 0.0, 0.0]), "zyx")
+    steps = 0.001 * speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    qpos[1:, :2] = np.cumsum(steps, axis=0)[:-1]
+    qpos[-1, :2] += 0.03 * np.array([-np.sin(heading[-1]), np.cos(heading[-1])])
+    result = free_base.path_errors(qpos, wanted, 0.001)
+    assert result["path_error_max_m"] == pytest.approx(0.03, abs=1e-9)
+    assert result["heading_error_max_deg"] == pytest.approx(np.degrees(0.1), abs=1e-6)
+    assert free_base.path_errors(np.zeros((3, 15)), wanted[:3], 0.001) == {}
 
 
 @pytest.fixture(scope="module")
