@@ -74,12 +74,14 @@ class SpatialSpec:
     Attributes:
       nodes: largest number of nodes of the horizon.
       feet: largest number of feet that press, over all nodes.
+      model: that predicts, one of ``mpc.rigid_models.PREDICTIONS``.
       tolerance: relative residuals and gap at which the QP counts as solved [-].
       max_iterations: limit of the QP.
     """
 
     nodes: int
     feet: int
+    model: str = "momentum"
     tolerance: float = 1e-6
     max_iterations: int = 200
 

@@ -185,6 +185,9 @@ class SpatialConfig:
     Weights are per second of the horizon, of errors ahead, to the left and up.
     """
 
+    model: Literal["momentum", "convex", "present"] = "momentum"
+    """What predicts: exact momentum about the last plan's roll-out; Di Carlo's convex model; or the
+    rigid body linearised where the robot is [-]."""
     horizon: Positive = 0.25
     """Length of the prediction, at most a gait cycle [s]."""
     node_dt: Positive = 0.025
@@ -201,6 +204,8 @@ class SpatialConfig:
     """Weight of every squared force's distance from the gait's mean force [1/(m g)^2]."""
     friction: Annotated[float, Field(ge=0.05)] = 0.6
     """mu of the pyramids |F_x|, |F_y| <= mu F_z; below the ground's, for margin [-]."""
+    torque_fraction: TorqueFraction = 0.95
+    """Part of the joint torque limits that stance forces may take; inf: any [-]."""
     grf_z_min: Annotated[Bound, MIN_GRF, FORCE] = 0.04
     """Lower bound of F_z per leg [m g]."""
     grf_z_max: Annotated[Bound, GRF, FORCE] = 2.0
@@ -212,6 +217,12 @@ class SpatialConfig:
     velocity_time: Annotated[Positive, TIME] = 0.15
     """Time in which the velocity is predicted to reach its reference, for the next footholds
     [s]."""
+    slope_time: Annotated[Positive, TIME] = 0.15
+    """Time in which the ground's slope, a plane through the last footholds, is filtered [s]."""
+    alignment: Annotated[float, Field(ge=0, le=1)] = 1.0
+    """Part of the ground's slope that the trunk takes; 0: it stays level [-]."""
+    lift: Annotated[NonNegative, LENGTH] = 0.14
+    """Further height of the swings once a foot has hit something on its way up [L]."""
     tolerance: Positive = 1e-6
     """Relative residuals and gap at which the QP counts as solved [-]."""
     max_iterations: Count = 200

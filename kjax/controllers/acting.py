@@ -7,7 +7,7 @@
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from kjax.controllers.params import ControllerParams, Tables
 from kjax.controllers.state import ControllerState
 from kjax.legs import contact, lateral, swing
 from kjax.legs.base import Base, Footing, JointTargets, LegCommand, View
+from kjax.legs.ground import moved, rise
 from kjax.types import JointCommand, Observation
 
 Act = Callable[[Tables, ControllerState, Observation], tuple[ControllerState, JointCommand]]
@@ -88,9 +89,11 @@ def build_act(base: Base, act_dt: float) -> Act:
         valid = sample.valid
         base_vel = jnp.where(valid, view.base_vel, state.base_vel)
         motion = act_dt * base_vel
+        ground, slope = _ground_after(state, motion)
         next_state = state._replace(
             swing=swing.carry_along(feet.swings, motion),
-            ground=state.ground - motion[-1],
+            ground=ground,
+            slope=slope,
             feet=jnp.where(valid, view.feet, state.feet) - motion,
             base_vel=base_vel,
             torque=command.torque,
@@ -100,6 +103,21 @@ def build_act(base: Base, act_dt: float) -> Act:
         return next_state, command
 
     return act
+
+
+def _ground_at(state: ControllerState, feet: Float[Array, "4 d"]) -> Array:
+    """Height of the ground below some feet, or of all of it where it is level [m]."""
+    if state.slope is None:
+        return state.ground
+    return state.ground + rise(state.slope.slope, feet[:, :2])
+
+
+def _ground_after(state: ControllerState, motion: Float[Array, "d"]) -> tuple[Array, Any]:
+    """Height and slope of the ground below an origin that has moved on."""
+    height = state.ground - motion[-1]
+    if state.slope is None:
+        return height, None
+    return height + rise(state.slope.slope, motion[:2]), moved(state.slope, motion)
 
 
 def facing(track: Array | None) -> Array | None:
@@ -136,6 +154,7 @@ def _foot_targets(
         stance_time=params.schedule.stance_time[state.clock.gait, state.clock.phase],
         velocity=state.velocity.at[0].add(state.correction[0]),
         ground=state.ground,
+        slope=None if state.slope is None else state.slope.slope,
     )
     target = base.foothold(robot, *settings, view, footing)
     foot, foot_vel = swing.foot_path(settings.swing, swings, target)
@@ -147,7 +166,7 @@ def _foot_targets(
         contact.LegPhase(state.stance, state.clock.elapsed, swings.elapsed),
         contact.FootMotion(view.feet, view.feet_vel),
         contact.FootMotion(foot, foot_vel),
-        state.ground + robot.foot_radius,
+        _ground_at(state, view.feet) + robot.foot_radius,
         act_dt,
     )
     flags = flags._replace(flicker=flags.flicker & sample.valid)

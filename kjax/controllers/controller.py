@@ -32,6 +32,7 @@ from kjax.controllers.spatial import PlanFrom, build_spatial_plan, start_spatial
 from kjax.controllers.state import ControllerState, PlanInfo
 from kjax.legs import contact, swing
 from kjax.legs.base import Base, View, build_base, to_local
+from kjax.legs.ground import start_slope
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc.lmpc import LmpcMemory, start_memory
 from kjax.precision import full_precision
@@ -174,6 +175,7 @@ def _init_from(
         command=jnp.zeros((len(COMMAND_NAMES),), zero.dtype),
         height=zero,
         ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
+        slope=None if spec.spatial is None else start_slope(params.robot.foot_radius, view.feet),
         velocity=jnp.zeros((3,), zero.dtype),
         correction=jnp.zeros((2,), zero.dtype),
         memory=(
@@ -182,7 +184,7 @@ def _init_from(
             else start_spatial(spec.spatial, zero.dtype)
         ),
         force=jnp.zeros((4, 3), zero.dtype),
-        swing=swing.initial_swing(view.feet),
+        swing=swing.initial_swing(view.feet, lifts=spec.spatial is not None),
         feet=view.feet,
         base_vel=view.base_vel,
         torque=jnp.zeros((4, 3), zero.dtype),

@@ -49,6 +49,8 @@ class SpatialParams(NamedTuple):
       slew: of the reference yaw rate [rad/s^2].
       heading_slack: clamp of the heading reference's lead [rad].
       velocity_time: in which the velocity is predicted to reach its reference [s].
+      slope_time: in which the slope of the ground is filtered [s].
+      alignment: part of that slope that the trunk takes [-].
     """
 
     body: SpatialBody
@@ -59,6 +61,8 @@ class SpatialParams(NamedTuple):
     slew: Float[Array, ""]
     heading_slack: Float[Array, ""]
     velocity_time: Float[Array, ""]
+    slope_time: Float[Array, ""]
+    alignment: Float[Array, ""]
 
 
 class ControllerParams(NamedTuple):

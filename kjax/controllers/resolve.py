@@ -151,6 +151,7 @@ def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> Contr
             horizontal_fraction=_number(leg.horizontal_fraction),
             hold_after=_number(leg.hold_after),
             reach_speed=_number(leg.reach_speed),
+            lift=_number(si.spatial.lift),
             kp=stacked([leg.abduction_kp, leg.swing_kp, leg.swing_kp]),
             kd=stacked([leg.abduction_kd, leg.swing_kd, leg.swing_kd]),
         ),

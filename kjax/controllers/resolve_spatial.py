@@ -23,6 +23,7 @@ def spatial_spec(gaits: list[gait.Gait], config: SpatialConfig) -> SpatialSpec:
     return SpatialSpec(
         nodes=whole + borders,
         feet=2 * (whole + borders),
+        model=config.model,
         tolerance=config.tolerance,
         max_iterations=config.max_iterations,
     )
@@ -56,13 +57,17 @@ def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> 
             force=_floats(own.force),
         ),
         limits=momentum.Limits(
-            friction=_floats(own.friction), force_z=stacked([own.grf_z_min, own.grf_z_max])
+            friction=_floats(own.friction),
+            force_z=stacked([own.grf_z_min, own.grf_z_max]),
+            torque=_floats(own.torque_fraction) * robot.torque_limit,
         ),
         grid=stacked([own.horizon, own.node_dt]),
         force_z=mean_force(gaits, config, robot),
         slew=_floats(own.yaw_slew),
         heading_slack=_floats(own.heading_slack),
         velocity_time=_floats(own.velocity_time),
+        slope_time=_floats(own.slope_time),
+        alignment=_floats(own.alignment),
     )
 
 

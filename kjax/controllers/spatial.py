@@ -23,8 +23,10 @@ from kjax.dynamics.srb_spatial import BodyState
 from kjax.legs import contact, lateral, spatial, swing
 from kjax.legs.base import View
 from kjax.legs.footholds import Arrival, footholds, turned
+from kjax.legs.ground import next_slope, rise, soles, upright
 from kjax.mpc import grid, momentum
 from kjax.mpc.momentum import MomentumMemory
+from kjax.mpc.rigid_models import PREDICTIONS
 from kjax.spec import ControllerSpec, SpatialSpec
 
 USABLE = 1e-2  # residual up to which a plan at the iteration limit walks better than none
@@ -79,6 +81,7 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
     """``Controller.plan_from`` of the LMPC in three dimensions."""
     assert spec.spatial is not None
     sizes, control_dt = spec.spatial, spec.control_dt
+    predict = PREDICTIONS[sizes.model]
 
     def plan_from(
         tables: Tables, state: ControllerState, view: View, flags: Array, valid: Array
@@ -92,11 +95,18 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
         stance = params.schedule.stance[clock.gait, clock.phase]
         feet = jnp.where(valid, view.feet, state.feet)
         swings = next_swings(params, state, clock, stance, flags, feet)
-        ground = mean_height(feet[:, 2] - params.robot.foot_radius, stance, state.ground)
+        assert state.slope is not None
+        touching = soles(params.robot.foot_radius, feet, state.slope.slope)
+        slope = next_slope(
+            state.slope, touching, stance & flags & valid, control_dt / own.slope_time
+        )
+        level = feet[:, 2] - params.robot.foot_radius - rise(slope.slope, feet[:, :2])
+        ground = mean_height(level, stance, state.ground)  # below the trunk's origin
+        below = ground + rise(slope.slope, body.com[:2] - body.base[:2])
 
         velocity = spatial.rotate(body.heading, body.com_vel)
         omega = spatial.rotate(body.heading, body.omega)
-        origin = jnp.stack([body.com[0], body.com[1], ground])
+        origin = jnp.stack([body.com[0], body.com[1], below])
         start = BodyState(
             p=body.com - origin,
             R=body.rotation,
@@ -108,19 +118,21 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
             params.schedule, clock, sizes.nodes,
             node_dt=own.grid[1], horizon=own.grid[0], shortest=0.5 * control_dt,
         )  # fmt: skip
-        targets = _targets(params, clock, nodes, motion)
+        targets = _targets(params, clock, nodes, motion, slope.slope)
         com = body.rotation.T @ (body.com - body.base)
-        contacts = _contacts(params, clock, nodes, motion, feet - origin[None], com)
+        contacts = _contacts(
+            params, clock, nodes, motion, touching - origin[None], com, slope.slope
+        )
         nominal = momentum.shifted(state.memory, nodes, targets.force, control_dt)
+        response = predict(own.body, start, nodes.length, contacts, nominal, targets)
+        torques = _torque_maps(params, response.states, contacts, com)
         solved = momentum.solve(
-            own.body,
-            start,
+            response,
             nodes,
-            contacts,
             nominal,
             targets,
             own.weights,
-            own.limits,
+            momentum.foot_rows(own.limits, upright(slope.slope), torques),
             grid.list_feet(nodes.stance, sizes.feet),
             tolerance=sizes.tolerance,
             max_iterations=sizes.max_iterations,
@@ -136,6 +148,7 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
             command=motion.command,
             height=motion.height,
             ground=jnp.where(valid, ground, state.ground),
+            slope=jax.tree.map(lambda a, b: jnp.where(valid, a, b), slope, state.slope),
             velocity=motion.velocity,
             memory=MomentumMemory(force, nodes.end, jnp.ones((), bool)),
             force=jnp.where(stance[:, None], force[0], 0.0),
@@ -184,14 +197,18 @@ def _next_motion(
 
 
 def _targets(
-    params: ControllerParams, clock: gait.Clock, nodes: grid.Grid, motion: _Motion
+    params: ControllerParams,
+    clock: gait.Clock,
+    nodes: grid.Grid,
+    motion: _Motion,
+    slope: Float[Array, "2"],
 ) -> momentum.Targets:
     """What the body shall do at the nodes' ends, in the frame of the plan."""
     own = params.spatial
     assert own is not None
     way, velocity, heading = motion.at(nodes.end)
-    place = nodes.end - nodes.begin
-    periodic = periodic_motion(params, clock.gait, nodes.phase, nodes.cycle, place)
+    within = nodes.end - nodes.begin
+    periodic = periodic_motion(params, clock.gait, nodes.phase, nodes.cycle, within)
     z, theta, v_z, pitch_rate = periodic.T
     zero = jnp.zeros_like(z)
 
@@ -199,22 +216,33 @@ def _targets(
         return rotations.exp(jnp.stack([angle if i == axis else zero for i in range(3)], axis=-1))
 
     turn = about(heading, 2)
-    roll = jnp.broadcast_to(motion.command[ROLL], z.shape)
+    ahead, left = (
+        jnp.stack([jnp.cos(heading), jnp.sin(heading)]),
+        jnp.stack([-jnp.sin(heading), jnp.cos(heading)]),
+    )
+    # Axes of a trunk that lies along a plane: nose along it, then the left side.
+    along = jnp.arctan(own.alignment * slope @ ahead)
+    lean = jnp.arctan(own.alignment * slope @ left * jnp.cos(along))
     # Nose up is a turn about the axis to the right.
-    R = turn @ about(-(theta + motion.command[PITCH]), 1) @ about(roll, 0)
-    omega = jnp.stack([zero, -pitch_rate, zero + motion.velocity[2]], axis=-1)
-    height = params.height[clock.gait] + motion.height + z
+    pitch, roll = theta + motion.command[PITCH] + along, motion.command[ROLL] + lean
+    R = turn @ about(-pitch, 1) @ about(roll, 0)
+    yaw_rate = zero + motion.velocity[2]
+    # Along a plane the trunk turns about its normal.
+    tilted = own.alignment * yaw_rate
+    omega = jnp.stack([-(slope @ ahead) * tilted, -(slope @ left) * tilted - pitch_rate, yaw_rate])
+    place = motion.lag[None] + way
+    height = params.height[clock.gait] + motion.height + z + rise(slope, place)
     full = params.schedule.duration[clock.gait]
     used = jnp.arange(full.shape[0]) < params.schedule.phases[clock.gait]
-    ahead = gait.preview(params.schedule, clock, 0.0).duration.sum()
-    load = own.force_z[clock.gait] * (ahead / jnp.sum(jnp.where(used, full, 0.0)))
+    cycle = gait.preview(params.schedule, clock, 0.0).duration.sum()
+    load = own.force_z[clock.gait] * (cycle / jnp.sum(jnp.where(used, full, 0.0)))
     force_z = jnp.where(nodes.stance, jnp.repeat(load, 2)[None], 0.0)
     flat = jnp.zeros_like(force_z)
     return momentum.Targets(
         R=R,
-        p=jnp.concatenate([motion.lag[None] + way, height[:, None]], axis=1),
-        omega=jnp.einsum("kij,kj->ki", turn, omega),
-        v=jnp.concatenate([velocity, v_z[:, None]], axis=1),
+        p=jnp.concatenate([place, height[:, None]], axis=1),
+        omega=jnp.einsum("kij,kj->ki", turn, omega.T),
+        v=jnp.concatenate([velocity, (v_z + rise(slope, velocity))[:, None]], axis=1),
         heading=jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1),
         force=jnp.stack([flat, flat, force_z], axis=-1),
     )
@@ -225,8 +253,9 @@ def _contacts(
     clock: gait.Clock,
     nodes: grid.Grid,
     motion: _Motion,
-    feet: Float[Array, "4 3"],
+    touching: Float[Array, "4 3"],
     com: Float[Array, "3"],
+    slope: Float[Array, "2"],
 ) -> Float[Array, "K 4 3"]:
     """Contact points of the legs in each node: where they stand, or will."""
     own = params.spatial
@@ -258,9 +287,25 @@ def _contacts(
         jnp.stack([settings.velocity_gain, sideways.foothold_gain]),
         motion.velocity[2],
     )
-    later = jnp.concatenate([place, jnp.zeros_like(place[..., :1])], axis=-1)
-    sole = jnp.stack([jnp.zeros_like(params.robot.foot_radius)] * 2 + [params.robot.foot_radius])
-    return jnp.where((lifted < 0)[..., None], (feet - sole[None])[None], later)
+    later = jnp.concatenate([place, rise(slope, place)[..., None]], axis=-1)
+    return jnp.where((lifted < 0)[..., None], touching[None], later)
+
+
+def _torque_maps(
+    params: ControllerParams,
+    states: BodyState,
+    contacts: Float[Array, "K 4 3"],
+    com: Float[Array, "3"],
+) -> Float[Array, "K 4 3 3"]:
+    """Torque of each joint per force on its foot, on the nominal way [m]."""
+    robot = params.robot
+
+    def one(R: Array, p: Array, touching: Array) -> Array:
+        foot = touching.at[:, 2].add(robot.foot_radius)
+        _, hip, trig = spatial.inverse(robot, (foot - p[None]) @ R + com[None] - robot.hip_pos)
+        return -jnp.einsum("lij,wi->ljw", spatial.foot_jacobian(robot, hip, trig), R)
+
+    return jax.vmap(one)(states.R[:-1], states.p[:-1], contacts)
 
 
 def _angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:

@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from kjax import gait
 from kjax.legs.contact import ContactState
+from kjax.legs.ground import GroundSlope
 from kjax.legs.swing import SwingState
 from kjax.mpc.lmpc import LmpcMemory
 from kjax.mpc.momentum import MomentumMemory
@@ -28,7 +29,9 @@ class ControllerState(NamedTuple):
       command: (6,) in force now, order of ``types.COMMAND_NAMES``.
       height: reference of the height above the gait's own, which follows the command at a bounded
         rate [m].
-      ground: height of the ground under the last stance feet, local frame [m].
+      ground: height of the ground under the last stance feet, local frame; where it slopes, below
+        the trunk [m].
+      slope: of the ground, from the last footholds; ``None`` in the planar controller.
       velocity: (3,) references of v_x, v_y and yaw rate, which follow the command at bounded rates;
         the planar controller's has v_x alone [m/s, m/s, rad/s].
       correction: integrals of the errors of velocity and pitch, added to their references
@@ -54,6 +57,7 @@ class ControllerState(NamedTuple):
     command: Float[Array, "6"]
     height: Float[Array, ""]
     ground: Float[Array, ""]
+    slope: GroundSlope | None
     velocity: Float[Array, "3"]
     correction: Float[Array, "2"]
     memory: LmpcMemory | MomentumMemory

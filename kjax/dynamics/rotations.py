@@ -33,6 +33,13 @@ def exp(w: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     return one + a[..., None, None] * K + b[..., None, None] * (K @ K)
 
 
+def inverse(M: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
+    """Inverse of a well-conditioned 3 x 3 matrix, by its cofactors: no call of LAPACK."""
+    a, b, c = (M[..., i, :] for i in range(3))
+    columns = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
+    return columns / jnp.sum(a * columns[..., 0], axis=-1)[..., None, None]
+
+
 def log(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
     """The shortest w with exp(w) = R, below half a turn [rad]; smooth at the identity."""
     # |v| = 2 sin(angle); the arctangent is well conditioned at both ends.

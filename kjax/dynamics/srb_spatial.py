@@ -66,7 +66,7 @@ def angular_velocity(
     body: SpatialBody, R: Float[Array, "3 3"], L: Float[Array, "3"]
 ) -> Float[Array, "3"]:
     """I_w^-1 L, world frame [rad/s]."""
-    return R @ jnp.linalg.solve(body.inertia, R.T @ L)
+    return R @ (rotations.inverse(body.inertia) @ (R.T @ L))
 
 
 def momentum(

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from kjax.legs import lateral, spatial, swing
 from kjax.legs.footholds import Arrival, footholds, turned
+from kjax.legs.ground import rise
 from kjax.legs.kinematics import PlanarState, foot_jacobian, planar_state
 from kjax.legs.stance import spatial_stance_torque, stance_torque
 from kjax.types import Observation, RobotParams
@@ -74,13 +75,15 @@ class Footing(NamedTuple):
       remaining: (4,) time to touchdown [s].
       stance_time: (4,) length of the stance to come [s].
       velocity: (3,) v_x, v_y and yaw rate wanted [m/s, m/s, rad/s].
-      ground: height of the ground, frame of the view [m].
+      ground: height of the ground, frame of the view; where it slopes, below the origin [m].
+      slope: (2,) its rise along x and y; ``None`` where it counts as level [-].
     """
 
     remaining: Float[Array, "4"]
     stance_time: Float[Array, "4"]
     velocity: Float[Array, "3"]
     ground: Float[Array, ""]
+    slope: Float[Array, "2"] | None
 
 
 class Base(NamedTuple):
@@ -261,8 +264,9 @@ def _turning_foothold(
         jnp.stack([settings.velocity_gain, sideways.foothold_gain]),
         yaw_rate,
     )
-    height = jnp.full_like(place[:, :1], footing.ground + robot.foot_radius)
-    return jnp.concatenate([place, height], axis=1)
+    assert footing.slope is not None  # the spatial controller's state has it
+    height = footing.ground + rise(footing.slope, place) + robot.foot_radius
+    return jnp.concatenate([place, height[:, None]], axis=1)
 
 
 def _spatial_joints(

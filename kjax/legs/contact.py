@@ -93,7 +93,7 @@ def read_flags(
     phase: LegPhase,
     feet: FootMotion,
     path: FootMotion,
-    ground: Float[Array, ""],
+    ground: Float[Array, "*leg"],
     dt: float,
 ) -> Flags:
     """What the flags of a sample tell, ``dt`` [s] after the last one.
@@ -104,7 +104,7 @@ def read_flags(
       phase: of each leg.
       feet: as measured.
       path: of the swing feet, as wanted.
-      ground: height of the foot centres on the ground [m].
+      ground: height of the foot centres on the ground, one or (4,) [m].
       dt: time since the last sample [s].
     """
     on_time = jnp.where(contact, state.on_time + dt, 0.0)

@@ -10,6 +10,8 @@ from kjax.legs.contact import Flags
 from kjax.legs.kinematics import PlanarState, inverse, joint_rates
 from kjax.types import RobotParams
 
+LEAVING = 0.1  # part of a swing in which a foot may still touch what it stood on
+RAISED_TIME = 1.0  # s, in which the further height of swings fades after a foot has hit something
 MAX_JOINT_RATE = 20.0  # rad/s; bounds the reference near singular legs
 
 
@@ -25,6 +27,8 @@ class SwingParams(NamedTuple):
       hold_after: part of the swing after which a contact means an obstacle [-].
       reach_speed: at which a foot feels for the ground when a change of gait has cut its swing
         short; 0: its leg presses at once [m/s].
+      lift: further apex after a foot has hit something on its way up; not read where the state's
+        ``raised`` is ``None`` [m].
       kp: joint stiffness of (abduction, thigh, calf) [N m/rad].
       kd: joint damping of the same [N m s/rad].
     """
@@ -35,6 +39,7 @@ class SwingParams(NamedTuple):
     horizontal_fraction: Float[Array, ""]
     hold_after: Float[Array, ""]
     reach_speed: Float[Array, ""]
+    lift: Float[Array, ""]
     kp: Float[Array, "3"]
     kd: Float[Array, "3"]
 
@@ -60,6 +65,8 @@ class SwingState(NamedTuple):
       held: (4,) whether an early contact stopped the foot.
       held_at: (4, d) where it did, or where a reaching foot shall be, likewise [m].
       reaching: (4,) whether the leg is due to stand but has not found the ground yet.
+      raised: further apex of all swings since a foot has hit something, fading; ``None`` where
+        swings do not lift over [m].
     """
 
     lift_off: Float[Array, "4 d"]
@@ -68,10 +75,16 @@ class SwingState(NamedTuple):
     held: Bool[Array, "4"]
     held_at: Float[Array, "4 d"]
     reaching: Bool[Array, "4"]
+    raised: Float[Array, ""] | None
 
 
-def initial_swing(feet: Float[Array, "4 d"]) -> SwingState:
-    """State before the first swing, feet (4, d) [m]."""
+def initial_swing(feet: Float[Array, "4 d"], *, lifts: bool = False) -> SwingState:
+    """State before the first swing.
+
+    Args:
+      feet: (4, d) [m].
+      lifts: whether a foot that hits something on its way up lifts over it.
+    """
     zeros = jnp.zeros((4,), feet.dtype)
     none = jnp.zeros((4,), bool)
     return SwingState(
@@ -81,6 +94,7 @@ def initial_swing(feet: Float[Array, "4 d"]) -> SwingState:
         held=none,
         held_at=feet,
         reaching=none,
+        raised=jnp.zeros((), feet.dtype) if lifts else None,
     )
 
 
@@ -91,12 +105,11 @@ def begin_swings(
     duration: Float[Array, "4"],
 ) -> SwingState:
     """State with new swings of ``duration`` [s] for the legs that are ``lifting`` off now."""
-    return SwingState(
+    return state._replace(
         lift_off=jnp.where(lifting[:, None], feet, state.lift_off),
         elapsed=jnp.where(lifting, 0.0, state.elapsed),
         duration=jnp.where(lifting, duration, state.duration),
         held=state.held & ~lifting,
-        held_at=state.held_at,
         reaching=state.reaching & ~lifting,
     )
 
@@ -152,6 +165,8 @@ def hold_feet(
       feet: (4, d) where the feet are [m].
       dt: time step [s].
     """
+    if state.raised is not None:
+        state = _lift_over(params, state, flags, feet, dt)
     late = state.elapsed > params.hold_after * state.duration
     caught = flags.blocked & late & ~state.held
     reaching = state.reaching & ~flags.contact
@@ -161,6 +176,22 @@ def hold_feet(
         held_at=jnp.where(caught[:, None], feet, state.held_at.at[:, -1].add(-sink)),
         reaching=reaching,
     )
+
+
+def _lift_over(
+    params: SwingParams, state: SwingState, flags: Flags, feet: Float[Array, "4 d"], dt: float
+) -> SwingState:
+    """State after feet have hit something on their way up.
+
+    Such a foot goes on from where it is, as if it lifted off there: up first. Where one foot met
+    something others will, so all swings are higher for a while.
+    """
+    early = state.elapsed <= params.hold_after * state.duration
+    left_ground = state.elapsed > LEAVING * state.duration
+    stumbled = flags.blocked & early & left_ground & ~state.held
+    raised = jnp.where(stumbled.any(), params.lift, state.raised * (1.0 - dt / RAISED_TIME))
+    state = begin_swings(state, stumbled, feet, state.duration - state.elapsed)
+    return state._replace(raised=raised)
 
 
 def foothold(
@@ -246,7 +277,8 @@ def foot_path(
     along = state.lift_off[:, :-1] + (target[:, :-1] - state.lift_off[:, :-1]) * shift
     along_rate = (target[:, :-1] - state.lift_off[:, :-1]) * shift_rate
 
-    top = jnp.maximum(state.lift_off[:, -1], target[:, -1]) + params.apex
+    apex = params.apex if state.raised is None else params.apex + state.raised
+    top = jnp.maximum(state.lift_off[:, -1], target[:, -1]) + apex
     rising = phase < 0.5
     low = jnp.where(rising, state.lift_off[:, -1], top)
     high = jnp.where(rising, top, target[:, -1])

@@ -13,7 +13,7 @@ of x = (d, p - p_b, Lam - L_b, v - v_b):
     x_{k+1} = A_k x_k + sum over the standing feet of B_kf u_kf,   x_0 = 0
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from kjax.dynamics.rotations import skew
 from kjax.dynamics.srb_spatial import BodyState, Contacts, SpatialBody
 from kjax.mpc.grid import FootNodes, Grid
 
-STATE = 12  # numbers of x, and of the errors that the cost weighs
+STATE = 12  # numbers of this model's x, and of the errors that the cost weighs
 
 
 class Targets(NamedTuple):
@@ -67,14 +67,32 @@ class Weights(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What a foot may press.
+    """What a foot may press, and a leg's joints may bear.
 
     Attributes:
       friction: mu of the pyramid [-].
       force_z: (2,) bounds of F_z [N].
+      torque: (3,) bounds of the joints' torques [N m].
     """
 
     friction: Float[Array, ""]
+    force_z: Float[Array, "2"]
+    torque: Float[Array, "3"]
+
+
+class FootRows(NamedTuple):
+    """Bounds of each foot's force in each node: low <= matrix F <= high.
+
+    Attributes:
+      matrix: (K, 4, r, 3) rows.
+      low: (r,) their lower bounds.
+      high: (r,) their upper bounds.
+      force_z: (2,) bounds of F_z [N].
+    """
+
+    matrix: Float[Array, "K 4 r 3"]
+    low: Float[Array, "r"]
+    high: Float[Array, "r"]
     force_z: Float[Array, "2"]
 
 
@@ -93,17 +111,22 @@ class MomentumMemory(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Prediction about the nominal roll-out.
+    """Prediction about a nominal roll-out, by this model or another one, of n numbers x.
 
     Attributes:
       states: nominal ones (K + 1, ...), the first one now.
-      A: (K, 12, 12).
-      B: (K, 4, 12, 3) of each leg.
+      omega: (K, 3) nominal angular velocity at the nodes' ends [rad/s].
+      A: (K, n, n).
+      B: (K, 4, n, 3) of each leg's force.
+      outputs: (K, 12, n) changes of attitude (a turn of the nominal one, world), place, angular
+        velocity and velocity by x at the nodes' ends.
     """
 
     states: BodyState
-    A: Float[Array, "K 12 12"]
-    B: Float[Array, "K 4 12 3"]
+    omega: Float[Array, "K 3"]
+    A: Float[Array, "K n n"]
+    B: Float[Array, "K 4 n 3"]
+    outputs: Float[Array, "K 12 n"]
 
 
 class MomentumPlan(NamedTuple):
@@ -111,14 +134,12 @@ class MomentumPlan(NamedTuple):
 
     Attributes:
       force: (K, 4, 3) force of each leg in each node, world [N].
-      states: (K + 1, ...) nominal states.
       status: a ``qp.Status``.
       residual: largest of primal and dual residual and gap [-].
       iterations: of the solver.
     """
 
     force: Float[Array, "K 4 3"]
-    states: BodyState
     status: Int[Array, ""]
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -144,8 +165,20 @@ def linearise(
     now, then = (
         jax.tree.map(lambda a, s=s: a[s], states) for s in (slice(None, -1), slice(1, None))
     )
-    pieces = jax.vmap(_node, (None, 0, 0, 0, 0, 0))(body, now, then, length, feet, nominal)
-    return Response(states, *pieces)
+    A, B = jax.vmap(_node, (None, 0, 0, 0, 0, 0))(body, now, then, length, feet, nominal)
+    omega, outputs = jax.vmap(_outputs, (None, 0))(body, then)
+    return Response(states, omega, A, B, outputs)
+
+
+def _outputs(
+    body: SpatialBody, state: BodyState
+) -> tuple[Float[Array, "3"], Float[Array, "12 12"]]:
+    """Angular velocity of a state; attitude, place, angular velocity and velocity by x."""
+    W = state.R @ rotations.inverse(body.inertia) @ state.R.T
+    omega = W @ state.L
+    turning = W @ skew(state.L) - skew(omega)
+    outputs = jnp.eye(STATE, dtype=omega.dtype).at[6:9].set(0.0)
+    return omega, outputs.at[6:9, :3].set(turning).at[6:9, 6:9].set(W)
 
 
 def _node(
@@ -163,9 +196,9 @@ def _node(
     mean = now.p + h / 2 * now.v + h**2 / 6 * a  # of the path over the node
     pull = h * skew(total)
     turn = rotations.exp(h / 2 * srb_spatial.angular_velocity(body, now.R, now.L)) @ now.R
-    W = turn @ jnp.linalg.solve(body.inertia, turn.T)
+    W = turn @ rotations.inverse(body.inertia) @ turn.T
     half = h / 2 * W @ skew((now.L + then.L) / 2)
-    back = jnp.linalg.inv(eye - half)
+    back = rotations.inverse(eye - half)
     by_L = h / 2 * back @ W  # of d by the sum of Lam before and after
 
     # Rows: d, p, Lam, v. d sees the mean of Lam before and after the node.
@@ -212,76 +245,87 @@ def shifted(
 
 
 def errors(
-    body: SpatialBody, states: BodyState, targets: Targets
-) -> tuple[Float[Array, "K 12"], Float[Array, "K 12 12"]]:
+    response: Response, targets: Targets
+) -> tuple[Float[Array, "K 12"], Float[Array, "K 12 n"]]:
     """Errors of the nominal states (attitude, position, omega, velocity), and how x changes them.
 
     In the axes of the targets' heading.
 
     Args:
-      body: inertia.
-      states: nominal, at the nodes' ends (K, ...).
-      targets: there.
+      response: with the nominal states.
+      targets: at the nodes' ends.
     """
 
-    def one(state: BodyState, target: Targets) -> tuple[Array, Array]:
-        eye, zero = jnp.eye(3, dtype=state.p.dtype), jnp.zeros((3, 3), state.p.dtype)
+    def one(state: BodyState, omega: Array, outputs: Array, target: Targets) -> Any:
         e = rotations.log(state.R @ target.R.T)
         K = skew(e)
-        W = state.R @ jnp.linalg.solve(body.inertia, state.R.T)
-        omega = W @ state.L
-        error = [e, state.p - target.p, omega - target.omega, state.v - target.v]
-        rows = [
-            [eye - K / 2 + K @ K / 12, zero, zero, zero],
-            [zero, eye, zero, zero],
-            [W @ skew(state.L) - skew(omega), zero, W, zero],
-            [zero, zero, zero, eye],
-        ]
+        by_turn = jnp.eye(3, dtype=e.dtype) - K / 2 + K @ K / 12
+        error = jnp.stack([e, state.p - target.p, omega - target.omega, state.v - target.v])
         c, s = target.heading
         o = jnp.zeros_like(c)
         to_heading = jnp.stack(
             [jnp.stack([c, s, o]), jnp.stack([-s, c, o]), jnp.stack([o, o, o + 1])]
         )
-        C = jnp.concatenate(
-            [jnp.concatenate([to_heading @ b for b in row], axis=1) for row in rows]
-        )
-        return jnp.concatenate([to_heading @ part for part in error]), C
+        rows = jnp.concatenate([(by_turn @ outputs[:3]), outputs[3:]]).reshape(4, 3, -1)
+        C = jnp.einsum("ij,gjn->gin", to_heading, rows).reshape(STATE, -1)
+        return (error @ to_heading.T).reshape(-1), C
 
-    return jax.vmap(one)(states, targets)
+    ends = jax.tree.map(lambda a: a[1:], response.states)
+    return jax.vmap(one)(ends, response.omega, response.outputs, targets)
+
+
+def foot_rows(
+    limits: Limits,
+    axes: Float[Array, "3 3"],
+    torques: Float[Array, "K 4 3 3"],
+) -> FootRows:
+    """Rows of friction pyramids and joint torques.
+
+    Args:
+      limits: of both.
+      axes: of the pyramids in its columns, the third one the ground's normal [-].
+      torques: (K, 4, 3, 3) torque of each joint per force of its foot, world [m].
+    """
+    mu = limits.friction
+    one, zero = jnp.ones_like(mu), jnp.zeros_like(mu)
+    sides = ((one, zero), (-one, zero), (zero, one), (zero, -one))
+    pyramid = jnp.stack([jnp.stack([*side, -mu]) for side in sides]) @ axes.T
+    most = jnp.concatenate([jnp.zeros_like(mu, shape=(4,)), limits.torque])
+    pyramids = jnp.broadcast_to(pyramid, (*torques.shape[:2], 4, 3))
+    return FootRows(
+        matrix=jnp.concatenate([pyramids, torques], axis=2),
+        low=jnp.concatenate([jnp.full_like(mu, -jnp.inf, shape=(4,)), -limits.torque]),
+        high=most,
+        force_z=limits.force_z,
+    )
 
 
 def solve(
-    body: SpatialBody,
-    start: BodyState,
+    response: Response,
     grid: Grid,
-    feet: Float[Array, "K 4 3"],
     nominal: Float[Array, "K 4 3"],
     targets: Targets,
     weights: Weights,
-    limits: Limits,
+    rows: FootRows,
     listed: FootNodes,
     *,
     tolerance: float = 1e-6,
     max_iterations: int = 200,
 ) -> MomentumPlan:
-    """Forces over the horizon. Eleven arguments: the problem's data, each of another origin.
+    """Forces over the horizon. Nine arguments: the problem's data, each of another origin.
 
     Args:
-      body: mass and inertia.
-      start: now.
+      response: of the body to changes of the nominal forces.
       grid: nodes.
-      feet: contact points of each leg in each node, world [m].
       nominal: forces that the prediction is made about, 0 in the air, world [N].
       targets: at the nodes' ends.
       weights: of their errors.
-      limits: of the forces.
+      rows: that the forces keep to.
       listed: feet that press.
       tolerance: at which the QP counts as solved [-].
       max_iterations: of the QP.
     """
-    response = linearise(body, start, grid.length, feet, nominal)
-    ends = jax.tree.map(lambda a: a[1:], response.states)
-    error, C = errors(body, ends, targets)
+    error, C = errors(response, targets)
     G = _condensed(response, listed)  # (K, 12, 3F)
     Y = C @ G
     weight = jnp.concatenate([weights.attitude, weights.position, weights.omega, weights.velocity])
@@ -296,25 +340,23 @@ def solve(
     away = jnp.where(used, (base - targets.force[where]).reshape(-1), 0.0)
     q = 2.0 * (weighted.T @ error.reshape(-1) + cost * away)
 
-    rows, low_row, high_row, low, high = _limit_rows(limits, listed, base)
     solution = qp.solve_rows(
-        H, q, rows, low_row, high_row, low, high,
+        H, q, *_row_problem(rows, listed, base),
         method="active_set", tolerance=tolerance, max_iterations=max_iterations,
     )  # fmt: skip
     change = jnp.where(used, solution.x, 0.0).reshape(-1, 3)
     force = nominal.at[where].add(change)
     return MomentumPlan(
         force=force,
-        states=response.states,
         status=solution.status,
         residual=jnp.maximum(jnp.maximum(solution.primal, solution.dual), solution.gap),
         iterations=solution.iterations,
     )
 
 
-def _condensed(response: Response, listed: FootNodes) -> Float[Array, "K 12 forces"]:
+def _condensed(response: Response, listed: FootNodes) -> Float[Array, "K n forces"]:
     """How x at each node's end depends on the changes of the listed forces."""
-    own = response.B[listed.node, listed.leg] * listed.used[:, None, None]  # (F, 12, 3)
+    own = response.B[listed.node, listed.leg] * listed.used[:, None, None]  # (F, n, 3)
     own = jnp.moveaxis(own, 0, 1)
 
     def one(G: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -323,30 +365,22 @@ def _condensed(response: Response, listed: FootNodes) -> Float[Array, "K 12 forc
         G = jnp.einsum("ij,jfc->ifc", A, G) + here
         return G, G
 
-    K = response.A.shape[0]
+    K, n = response.A.shape[:2]
     _, G = jax.lax.scan(one, jnp.zeros_like(own), (response.A, jnp.arange(K)))
-    return G.reshape(K, STATE, -1)
+    return G.reshape(K, n, -1)
 
 
-def _limit_rows(
-    limits: Limits, listed: FootNodes, base: Float[Array, "F 3"]
+def _row_problem(
+    rows: FootRows, listed: FootNodes, base: Float[Array, "F 3"]
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Rows of the friction pyramids with bounds, and the box, of the changes of the forces."""
-    F, mu = base.shape[0], limits.friction
-    one, zero = jnp.ones_like(mu), jnp.zeros_like(mu)
-    pyramid = jnp.stack(
-        [
-            jnp.stack([one, zero, -mu]),
-            jnp.stack([-one, zero, -mu]),
-            jnp.stack([zero, one, -mu]),
-            jnp.stack([zero, -one, -mu]),
-        ]
-    )
-    eye = jnp.eye(F, dtype=base.dtype)
-    rows = jnp.einsum("rc,fg->frgc", pyramid, eye).reshape(4 * F, 3 * F)
-    high_row = jnp.where(listed.used[:, None], -(base @ pyramid.T), 0.0).reshape(-1)
-    side = mu * limits.force_z[1]
-    high = jnp.stack([side, side, limits.force_z[1]])[None] - base
-    low = jnp.stack([-side, -side, limits.force_z[0]])[None] - base
+    """Rows with their bounds, and the box, of the changes of the listed forces."""
+    F, r = base.shape[0], rows.low.shape[0]
+    own = rows.matrix[listed.node, listed.leg] * listed.used[:, None, None]  # (F, r, 3)
+    matrix = jnp.einsum("frc,fg->frgc", own, jnp.eye(F, dtype=base.dtype)).reshape(F * r, 3 * F)
+    value = jnp.einsum("frc,fc->fr", own, base)
+    low_row, high_row = ((bound[None] - value).reshape(-1) for bound in (rows.low, rows.high))
+    free = jnp.full_like(base[:, :2], jnp.inf)
+    low = jnp.concatenate([-free, (rows.force_z[0] - base[:, 2])[:, None]], axis=1)
+    high = jnp.concatenate([free, (rows.force_z[1] - base[:, 2])[:, None]], axis=1)
     low, high = (jnp.where(listed.used[:, None], a, 0.0).reshape(-1) for a in (low, high))
-    return rows, jnp.full_like(high_row, -jnp.inf), high_row, low, high
+    return matrix, low_row, high_row, low, high

@@ -46,7 +46,7 @@ planar_state = jax.jit(kinematics.planar_state)
 
 def settings(dtype="float64"):
     values = {"apex": APEX, "horizontal_fraction": ACROSS, "hold_after": HOLD_AFTER}
-    values |= {"offset": OFFSET, "reach_speed": 0.8}
+    values |= {"offset": OFFSET, "reach_speed": 0.8, "lift": 0.0}
     values |= {"velocity_gain": 0.05, "kp": [200.0, 150.0, 120.0], "kd": [4.0, 3.0, 2.0]}
     return swing.SwingParams(**{name: jnp.asarray(v, dtype) for name, v in values.items()})
 
@@ -230,6 +230,52 @@ def test_before_the_first_swing_nothing_is_held_and_the_path_stays_at_the_feet()
     assert not state.held.any()
     position, _ = reference(settings(), state, jnp.asarray(TARGET))
     np.testing.assert_array_equal(position, LIFT_OFF)
+
+
+STUMBLE = 0.2 * DURATION
+
+
+def stumbled(elapsed, blocked=(True, False, False, False), steps=1):
+    """A swing whose first leg hits something ``elapsed`` seconds after it began."""
+    params = settings()._replace(lift=jnp.asarray(0.05), hold_after=jnp.asarray(0.6))
+    state = swing.initial_swing(jnp.asarray(LIFT_OFF), lifts=True)
+    state = swing.begin_swings(
+        state, jnp.ones(4, bool), jnp.asarray(LIFT_OFF), jnp.full(4, DURATION)
+    )
+    state = state._replace(elapsed=jnp.full(4, elapsed))
+    hit = jnp.asarray(LIFT_OFF) + 0.04
+    for _ in range(steps):
+        flags = flags_of(jnp.array(blocked), blocked=jnp.array(blocked))
+        state = swing.hold_feet(params, state, flags, hit, 0.001)
+        blocked = [False] * 4
+    return params, state, hit
+
+
+def test_a_foot_that_hits_something_on_its_way_up_starts_again_from_there_and_higher():
+    params, state, hit = stumbled(STUMBLE)
+    np.testing.assert_allclose(state.lift_off[0], hit[0])
+    np.testing.assert_allclose(state.lift_off[1:], LIFT_OFF[1:])
+    np.testing.assert_allclose(state.elapsed, [0.0, *[STUMBLE] * 3])
+    np.testing.assert_allclose(state.duration[0], DURATION - STUMBLE)  # it lands when it should
+    assert not state.held.any()
+    middle = state._replace(elapsed=0.5 * state.duration)
+    position, _ = reference(params, middle, jnp.asarray(TARGET))
+    high = np.maximum(np.asarray(middle.lift_off)[:, -1], np.asarray(TARGET)[:, -1])
+    np.testing.assert_allclose(position[:, -1] - high, APEX + 0.05, rtol=1e-6)
+
+
+def test_what_is_hit_late_holds_the_foot_and_what_is_left_with_does_not_count():
+    _, state, _ = stumbled(0.7 * DURATION)
+    assert state.held.tolist() == [True, False, False, False]
+    assert float(state.raised) == 0.0
+    _, state, _ = stumbled(0.05 * DURATION)
+    assert not state.held.any()
+    assert float(state.raised) == 0.0
+
+
+def test_the_higher_swings_fade_within_seconds():
+    _, state, _ = stumbled(STUMBLE, steps=1001)
+    assert float(state.raised) == pytest.approx(0.05 / np.e, rel=1e-3)
 
 
 def standing(x=0.0, pitch=0.0, velocity=0.0, dtype="float64"):

@@ -4,55 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from spatial_problem import BODY, nodes, problem, targets
 
 from kjax import qp
 from kjax.dynamics import rotations, srb_spatial
-from kjax.dynamics.srb_spatial import BodyState, Contacts, SpatialBody
-from kjax.gait import Clock, Gait, Phase, build_schedule
+from kjax.dynamics.srb_spatial import Contacts
 from kjax.mpc import grid, momentum
-
-INERTIA = [[0.1273, -0.0004, -0.0144], [-0.0004, 0.3944, -0.0001], [-0.0144, -0.0001, 0.4228]]
-BODY = SpatialBody(mass=jnp.asarray(12.743), inertia=jnp.asarray(INERTIA))
-WEIGHT = 12.743 * 9.81
-HIPS = np.array(
-    [[0.19, -0.127, 0.0], [0.19, 0.127, 0.0], [-0.19, -0.127, 0.0], [-0.19, 0.127, 0.0]]
-)
-TROT = Gait("trot", (Phase((1, 0, 0, 1), 0.2), Phase((0, 1, 1, 0), 0.2)))
-BOUND = Gait(
-    "bound",
-    (Phase((1, 1, 0, 0), 0.1), Phase((0,) * 4, 0.06), Phase((0, 0, 1, 1), 0.1),
-     Phase((0,) * 4, 0.05)),
-)  # fmt: skip
-SCHEDULE = build_schedule([TROT, BOUND])
-
-
-def clock(which, elapsed):
-    return Clock(*map(jnp.asarray, (which, 0, 0)), elapsed=jnp.asarray(elapsed))
-
-
-def nodes(which=0, elapsed=0.05, count=12, horizon=0.25):
-    return grid.build_grid(
-        SCHEDULE, clock(which, elapsed), count, node_dt=0.025, horizon=horizon, shortest=0.0025
-    )
-
-
-def problem(seed=0, which=0):
-    """A tilted, turning body, its grid, feet and forces that share the weight."""
-    rng = np.random.default_rng(seed)
-    found = nodes(which)
-    R = rotations.exp(jnp.asarray(rng.uniform(-0.2, 0.2, 3)))
-    omega = rng.uniform(-1, 1, 3)
-    start = BodyState(
-        jnp.array([0.0, 0.0, 0.27]),
-        R,
-        jnp.asarray(rng.uniform(-0.4, 0.4, 3)),
-        srb_spatial.momentum(BODY, R, jnp.asarray(omega)),
-    )
-    K = len(found.length)
-    feet = jnp.broadcast_to(jnp.asarray(HIPS + rng.uniform(-0.03, 0.03, (4, 3))), (K, 4, 3))
-    count = np.maximum(np.asarray(found.stance).sum(1), 1)[:, None, None]
-    share = np.asarray(found.stance)[..., None] * np.array([0.0, 0.0, WEIGHT]) / count
-    return start, found, feet, jnp.asarray(share)
 
 
 def test_nodes_end_where_phases_do():
@@ -128,22 +85,16 @@ def test_the_attitude_is_first_order_in_the_change_of_the_forces():
     assert 10 < large / small < 22  # second order: 16
 
 
-def targets(found, force):
-    K = len(found.length)
-    return momentum.Targets(
-        R=jnp.broadcast_to(jnp.eye(3), (K, 3, 3)),
-        p=jnp.stack([0.3 * found.end, 0.0 * found.end, 0.27 + 0.0 * found.end], axis=-1),
-        omega=jnp.zeros((K, 3)),
-        v=jnp.broadcast_to(jnp.array([0.3, 0.0, 0.0]), (K, 3)),
-        heading=jnp.broadcast_to(jnp.array([0.8, 0.6]), (K, 2)),
-        force=force,
-    )
-
-
 WEIGHTS = momentum.Weights(
     *(jnp.asarray(50 * np.array(w)) for w in ((50, 50, 30), (10, 10, 100), (0.2,) * 3, (2, 2, 1))),
     force=jnp.asarray(5e-4),
 )
+
+
+def rows(friction, force_z, nodes, torques=None, most=np.inf):
+    limits = momentum.Limits(jnp.asarray(friction), jnp.array(force_z), jnp.full(3, most))
+    torques = jnp.zeros((nodes, 4, 3, 3)) if torques is None else torques
+    return momentum.foot_rows(limits, jnp.eye(3), torques)
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -151,18 +102,18 @@ def test_plans_about_plans_end_at_a_minimum_of_the_nonlinear_cost(which):
     start, found, feet, nominal = problem(5, which)
     listed = grid.list_feet(found.stance, 24)
     wanted = targets(found, nominal)
-    loose = momentum.Limits(jnp.asarray(100.0), jnp.array([-1e4, 1e4]))
+    loose = rows(100.0, [-1e4, 1e4], len(found.length))
 
     @jax.jit
     def plan(force):
+        response = momentum.linearise(BODY, start, found.length, feet, force)
         return momentum.solve(
-            BODY, start, found, feet, force, wanted, WEIGHTS, loose, listed, tolerance=1e-9
+            response, found, force, wanted, WEIGHTS, loose, listed, tolerance=1e-9
         )
 
     def cost(force):
-        states = srb_spatial.rollout(BODY, start, Contacts(feet, force), found.length)
-        ends = jax.tree.map(lambda a: a[1:], states)
-        error = momentum.errors(BODY, ends, wanted)[0]
+        response = momentum.linearise(BODY, start, found.length, feet, force)
+        error = momentum.errors(response, wanted)[0]
         weight = jnp.concatenate([w for w in WEIGHTS[:4]])
         away = ((force - wanted.force) ** 2).sum(axis=(1, 2))
         return found.length @ (error**2 @ weight + WEIGHTS.force * away)
@@ -184,12 +135,18 @@ def test_forces_keep_to_cone_and_bounds():
     start, found, feet, nominal = problem(6)
     start = start._replace(v=jnp.array([-1.5, 0.8, 0.0]))
     listed = grid.list_feet(found.stance, 24)
-    limits = momentum.Limits(jnp.asarray(0.4), jnp.array([5.0, 90.0]))
-    solved = jax.jit(
-        lambda force: momentum.solve(
-            BODY, start, found, feet, force, targets(found, nominal), WEIGHTS, limits, listed
+    rng = np.random.default_rng(7)
+    torques = jnp.asarray(0.2 * rng.normal(size=(len(found.length), 4, 3, 3)))
+    limits = rows(0.4, [5.0, 90.0], len(found.length), torques, 13.0)
+
+    @jax.jit
+    def plan(force):
+        response = momentum.linearise(BODY, start, found.length, feet, force)
+        return momentum.solve(
+            response, found, force, targets(found, nominal), WEIGHTS, limits, listed
         )
-    )(nominal)
+
+    solved = plan(nominal)
     assert int(solved.status) == qp.Status.SOLVED
     x, y, z = np.moveaxis(np.asarray(solved.force)[np.asarray(found.stance)], -1, 0)
     assert z.min() >= 5.0 - 1e-6
@@ -197,3 +154,5 @@ def test_forces_keep_to_cone_and_bounds():
     assert (np.abs(x) <= 0.4 * z + 1e-6).all()
     assert (np.abs(y) <= 0.4 * z + 1e-6).all()
     assert (np.abs(x) > 0.4 * z - 1e-6).any()  # it brakes as hard as it may
+    torque = np.abs(np.einsum("klij,klj->kli", torques, solved.force))
+    assert torque.max() == pytest.approx(13.0, abs=1e-5)

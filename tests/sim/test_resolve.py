@@ -70,7 +70,10 @@ STATIC = {
     "noise.enabled", "noise.force",
 }  # fmt: skip
 # Likewise, of the spatial controller.
-SPATIAL = {"spatial.horizon", "spatial.node_dt", "spatial.tolerance", "spatial.max_iterations"}
+SPATIAL = {
+    "spatial.model", "spatial.horizon", "spatial.node_dt", "spatial.tolerance",
+    "spatial.max_iterations",
+}  # fmt: skip
 # What only means something beside other keys, needs a file, or is a list whose length counts.
 LEFT_OUT = {
     "koopman.file", "gait.times", "command.times", "push.times", "push.lateral",
