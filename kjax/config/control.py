@@ -214,6 +214,11 @@ class SpatialConfig:
     """Largest rate at which the reference yaw rate follows the command [rad/s^2]."""
     heading_slack: Positive = 0.3
     """Largest lead or lag of the heading's reference before the trunk [rad]."""
+    integral_gains: Annotated[Three, RATE] = (0.5, 0.5, 0.5)
+    """Rates at which the errors of velocity, ahead and to the left, and of the heading move their
+    references; 0: not [1/s]."""
+    integral_limits: Three = (0.1, 0.1, 0.1)
+    """Largest corrections of these references [m/s, m/s, rad]."""
     velocity_time: Annotated[Positive, TIME] = 0.15
     """Time in which the velocity is predicted to reach its reference, for the next footholds
     [s]."""

@@ -105,6 +105,12 @@ def build_act(base: Base, act_dt: float) -> Act:
     return act
 
 
+def _velocity_wanted(state: ControllerState) -> Float[Array, "3"]:
+    """References of v_x, v_y and yaw rate, integral action included."""
+    corrected = 1 if state.slope is None else 2  # the planar controller's second one is of pitch
+    return state.velocity.at[:corrected].add(state.correction[:corrected])
+
+
 def _ground_at(state: ControllerState, feet: Float[Array, "4 d"]) -> Array:
     """Height of the ground below some feet, or of all of it where it is level [m]."""
     if state.slope is None:
@@ -152,7 +158,7 @@ def _foot_targets(
     footing = Footing(
         remaining=jnp.maximum(swings.duration - swings.elapsed, 0.0),
         stance_time=params.schedule.stance_time[state.clock.gait, state.clock.phase],
-        velocity=state.velocity.at[0].add(state.correction[0]),
+        velocity=_velocity_wanted(state),
         ground=state.ground,
         slope=None if state.slope is None else state.slope.slope,
     )

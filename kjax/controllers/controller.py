@@ -177,7 +177,7 @@ def _init_from(
         ground=jnp.min(view.feet[:, -1]) - params.robot.foot_radius,
         slope=None if spec.spatial is None else start_slope(params.robot.foot_radius, view.feet),
         velocity=jnp.zeros((3,), zero.dtype),
-        correction=jnp.zeros((2,), zero.dtype),
+        correction=jnp.zeros((2 if spec.spatial is None else 3,), zero.dtype),
         memory=(
             start_memory(tables.lmpc, spec)
             if spec.spatial is None

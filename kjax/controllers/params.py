@@ -49,6 +49,8 @@ class SpatialParams(NamedTuple):
       slew: of the reference yaw rate [rad/s^2].
       heading_slack: clamp of the heading reference's lead [rad].
       velocity_time: in which the velocity is predicted to reach its reference [s].
+      integral: (2, 3) integral action on v_x, v_y and heading: its rates [1/s] and its limits
+        [m/s, m/s, rad].
       slope_time: in which the slope of the ground is filtered [s].
       alignment: part of that slope that the trunk takes [-].
     """
@@ -61,6 +63,7 @@ class SpatialParams(NamedTuple):
     slew: Float[Array, ""]
     heading_slack: Float[Array, ""]
     velocity_time: Float[Array, ""]
+    integral: Float[Array, "2 3"]
     slope_time: Float[Array, ""]
     alignment: Float[Array, ""]
 

@@ -66,6 +66,7 @@ def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> 
         slew=_floats(own.yaw_slew),
         heading_slack=_floats(own.heading_slack),
         velocity_time=_floats(own.velocity_time),
+        integral=stacked([own.integral_gains, own.integral_limits]),
         slope_time=_floats(own.slope_time),
         alignment=_floats(own.alignment),
     )

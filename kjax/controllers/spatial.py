@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from kjax import gait, qp
 from kjax.controllers.command import HEIGHT, PITCH, ROLL, V_X, V_Y, YAW_RATE
@@ -39,15 +39,17 @@ class _Motion(NamedTuple):
 
     Attributes:
       command: (6,) in force.
-      velocity: (3,) references of v_x, v_y and yaw rate.
+      velocity: (3,) references of v_x, v_y and yaw rate: the command at bounded rates.
+      correction: (3,) what integral action adds to those of v_x, v_y and the heading.
       height: reference of the height above the gait's own [m].
-      heading: reference of the yaw now [rad].
+      heading: reference of the yaw now, without that [rad].
       lag: (2,) reference of the place less the place [m].
       lead: (2,) velocity less its reference [m/s].
     """
 
     command: Float[Array, "6"]
     velocity: Float[Array, "3"]
+    correction: Float[Array, "3"]
     height: Float[Array, ""]
     heading: Float[Array, ""]
     lag: Float[Array, "2"]
@@ -55,17 +57,18 @@ class _Motion(NamedTuple):
 
     def at(self, t: Float[Array, "*k"]) -> tuple[Array, Array, Array]:
         """Way (*k, 2) and velocity (*k, 2) wanted, and heading (*k,), after a time ``t`` [s]."""
+        speed, first = self.velocity[:2] + self.correction[:2], self.heading + self.correction[2]
         angle = self.velocity[2] * t
         small = jnp.abs(angle) < 1e-4
         safe = jnp.where(small, 1.0, angle)
         ahead = jnp.where(small, 1.0 - angle**2 / 6.0, jnp.sin(safe) / safe)
         across = jnp.where(small, 0.5 * angle, (1.0 - jnp.cos(safe)) / safe)
-        now = turned(self.heading, self.velocity[:2])
+        now = turned(first, speed)
         way = jnp.stack(
             [ahead * now[0] - across * now[1], across * now[0] + ahead * now[1]], axis=-1
         )
-        heading = self.heading + angle
-        return t[..., None] * way, turned(heading, self.velocity[:2]), heading
+        heading = first + angle
+        return t[..., None] * way, turned(heading, speed), heading
 
 
 def start_spatial(spec: SpatialSpec, dtype: jnp.dtype) -> MomentumMemory:
@@ -113,7 +116,8 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
             v=velocity,
             L=srb_spatial.momentum(own.body, body.rotation, omega),
         )
-        motion = _next_motion(params, state, body.yaw, velocity, control_dt)
+        switched = clock.gait != state.clock.gait
+        motion = _next_motion(params, state, switched, body.yaw, velocity, control_dt)
         nodes = grid.build_grid(
             params.schedule, clock, sizes.nodes,
             node_dt=own.grid[1], horizon=own.grid[0], shortest=0.5 * control_dt,
@@ -150,6 +154,7 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
             ground=jnp.where(valid, ground, state.ground),
             slope=jax.tree.map(lambda a, b: jnp.where(valid, a, b), slope, state.slope),
             velocity=motion.velocity,
+            correction=jnp.where(valid, motion.correction, state.correction),
             memory=MomentumMemory(force, nodes.end, jnp.ones((), bool)),
             force=jnp.where(stance[:, None], force[0], 0.0),
             swing=swings,
@@ -175,6 +180,7 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
 def _next_motion(
     params: ControllerParams,
     state: ControllerState,
+    switched: Bool[Array, ""],
     yaw: Float[Array, ""],
     velocity: Float[Array, "3"],
     control_dt: float,
@@ -189,11 +195,19 @@ def _next_motion(
     climb = params.height_slew * control_dt
     height = state.height + jnp.clip(command[HEIGHT] - state.height, -climb, climb)
     ahead = _wrapped(state.heading + reference[2] * control_dt - yaw)
-    heading = _wrapped(yaw + jnp.clip(ahead, -own.heading_slack, own.heading_slack))
+    ahead = jnp.clip(ahead, -own.heading_slack, own.heading_slack)
+    heading = _wrapped(yaw + ahead)
     lead = velocity[:2] - turned(heading, reference[:2])
+    # Errors in the axes of the trunk, where what causes them stays.
+    error = jnp.append(turned(-heading, -lead), ahead)
+    rate, limit = own.integral
+    # Errors beyond the limit are a step on its way, not a bias.
+    correction = state.correction + rate * control_dt * jnp.clip(error, -limit, limit)
+    correction = jnp.where(switched, 0.0, jnp.clip(correction, -limit, limit))
+    lead = lead - turned(heading, correction[:2])
     slack = params.position_slack
     lag = jnp.clip(state.lag - lead * control_dt, -slack, slack)
-    return _Motion(command, reference, height, heading, lag, lead)
+    return _Motion(command, reference, correction, height, heading, lag, lead)
 
 
 def _targets(
@@ -277,6 +291,7 @@ def _contacts(
         velocity=velocity + error,
         error=error,
         heading=jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1),
+        height=jnp.broadcast_to(params.height[clock.gait] + motion.height, wait.shape[:1]),
     )
     place = jax.vmap(footholds, (None, None, 0, None, 0, None, None))(
         params.robot,

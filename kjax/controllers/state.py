@@ -34,8 +34,8 @@ class ControllerState(NamedTuple):
       slope: of the ground, from the last footholds; ``None`` in the planar controller.
       velocity: (3,) references of v_x, v_y and yaw rate, which follow the command at bounded rates;
         the planar controller's has v_x alone [m/s, m/s, rad/s].
-      correction: integrals of the errors of velocity and pitch, added to their references
-        [m/s, rad].
+      correction: integrals of errors, added to their references: of velocity and pitch in the
+        planar controller [m/s, rad], of v_x, v_y and heading in the spatial one [m/s, m/s, rad].
       memory: of the LMPC: its last plan and where the QP goes on from.
       force: (4, 3) force that each leg shall put on the robot, local axes; it holds in them until
         the next plan [N].
@@ -59,7 +59,7 @@ class ControllerState(NamedTuple):
     ground: Float[Array, ""]
     slope: GroundSlope | None
     velocity: Float[Array, "3"]
-    correction: Float[Array, "2"]
+    correction: Float[Array, "c"]
     memory: LmpcMemory | MomentumMemory
     force: Float[Array, "4 3"]
     swing: SwingState

@@ -248,23 +248,28 @@ def _turning_foothold(
     body = view.whole
     assert body is not None  # _free_view made it
     wait, yaw_rate = footing.remaining, footing.velocity[2]
-    angle = body.yaw + yaw_rate * wait
-    velocity = spatial.rotate(body.heading, body.com_vel)
+    assert footing.slope is not None  # the spatial controller's state has it
+    turn = yaw_rate * wait
+    angle = body.yaw + turn
+    # The way turns with the trunk.
+    now = spatial.rotate(body.heading, body.com_vel)[:2]
+    velocity = turned(turn, now)
+    below = footing.ground + rise(footing.slope, (body.com - body.base)[:2])
     place = footholds(
         robot,
         settings.offset,
         Arrival(
-            place=body.com[None, :2] + wait[:, None] * velocity[None, :2],
-            velocity=jnp.broadcast_to(velocity[:2], (4, 2)),
-            error=jnp.broadcast_to(velocity[:2], (4, 2)) - turned(angle, footing.velocity[:2]),
+            place=body.com[None, :2] + wait[:, None] * turned(0.5 * turn, now),
+            velocity=velocity,
+            error=velocity - turned(angle, footing.velocity[:2]),
             heading=jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1),
+            height=body.com[2] - below,
         ),
         body.rotation.T @ (body.com - body.base),
         footing.stance_time,
         jnp.stack([settings.velocity_gain, sideways.foothold_gain]),
         yaw_rate,
     )
-    assert footing.slope is not None  # the spatial controller's state has it
     height = footing.ground + rise(footing.slope, place) + robot.foot_radius
     return jnp.concatenate([place, height[:, None]], axis=1)
 

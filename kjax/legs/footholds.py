@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from kjax.types import RobotParams
+from kjax.types import GRAVITY, RobotParams
 
 
 class Arrival(NamedTuple):
@@ -16,12 +16,14 @@ class Arrival(NamedTuple):
       velocity: (4, 2) its velocity [m/s].
       error: (4, 2) velocity less the one wanted [m/s].
       heading: (4, 2) cosine and sine of the yaw [-].
+      height: of the centre of mass above the ground [m].
     """
 
     place: Float[Array, "4 2"]
     velocity: Float[Array, "4 2"]
     error: Float[Array, "4 2"]
     heading: Float[Array, "4 2"]
+    height: Float[Array, ""]
 
 
 def footholds(
@@ -36,7 +38,10 @@ def footholds(
     """Next foothold (x, y) of each leg, in the frame of ``body`` [m].
 
     Below the thigh joint of a level trunk at touchdown, half a stance's way of that point further,
-    and a correction of the velocity's error. Seven arguments: robot, gait, and what is expected.
+    and a correction of the velocity's error. On a curve the feet stand outside by height / g times
+    the centripetal acceleration: two feet bear no moment about the line between them.
+
+    Seven arguments: robot, gait, and what is expected.
 
     Args:
       robot: hip positions and abduction offsets.
@@ -54,7 +59,9 @@ def footholds(
     back = body.heading * jnp.array([[1.0, -1.0]], body.heading.dtype)
     correction = _rotate(body.heading, gain[None] * _rotate(back, body.error))
     way = 0.5 * stance_time[:, None] * (body.velocity + turning)
-    return body.place + lever + way + correction
+    inwards = yaw_rate * jnp.stack([-body.velocity[:, 1], body.velocity[:, 0]], axis=-1)
+    outside = -body.height / GRAVITY * inwards
+    return body.place + lever + way + outside + correction
 
 
 def turned(angle: Float[Array, "*k"], vector: Float[Array, "2"]) -> Float[Array, "*k 2"]:

@@ -18,6 +18,7 @@ from kjax.controllers.controller import build_controller
 from kjax.controllers.params import Tables
 from kjax.controllers.state import ControllerState
 from kjax.legs.base import build_base
+from kjax.legs.kinematics import PlanarState
 from kjax.robots import Robot
 from kjax.sim.episode import BatchSpec, EpisodeParams, SceneSpec
 from kjax.sim.excitation import perturb
@@ -26,7 +27,8 @@ from kjax.sim.observe import build_observe, find_addresses
 from kjax.sim.tick_stats import ReadWindow, build_read_window
 from kjax.types import Observation, RobotParams
 
-# Height of the centre of mass over the leg's length; about the trunk lying on the ground.
+# Height of the centre of mass above the lowest sole, over the leg's length; about the trunk lying
+# on the ground, wherever that is.
 FALL_HEIGHT = 0.28
 FALL_TILT = 1.0  # rad, pitch or roll
 
@@ -162,7 +164,7 @@ def build_closed_loop(
         true = see(sensed)
         true = true._replace(base_pos=true.base_pos - origin.astype(true.base_pos.dtype))
         body = base.view(tables.params.robot, state.track, true).planar
-        alive = state.alive & standing(tables.params.robot, body.x, true)
+        alive = state.alive & standing(tables.params.robot, body, true)
         log = TickLog(
             x=body.x,
             feet=body.feet,
@@ -217,11 +219,12 @@ def delayed_torque(ring: Any, torque: Any, place: Any, delay: Any) -> tuple[Any,
     return ring, ring[(place - delay) % count]
 
 
-def standing(robot: RobotParams, x: Float[Array, "6"], observation: Observation) -> Bool[Array, ""]:
+def standing(robot: RobotParams, body: PlanarState, observation: Observation) -> Bool[Array, ""]:
     """Whether the robot has not fallen; not a number is a fall."""
     w, i, j, k = observation.base_quat
     roll = jnp.arctan2(2.0 * (w * i + j * k), 1.0 - 2.0 * (i * i + j * j))
     finite = jnp.isfinite(observation.joint_pos).all() & jnp.isfinite(observation.joint_vel).all()
-    upright = (jnp.abs(x[2]) < FALL_TILT) & (jnp.abs(roll) < FALL_TILT)
+    upright = (jnp.abs(body.x[2]) < FALL_TILT) & (jnp.abs(roll) < FALL_TILT)
     least = FALL_HEIGHT * (robot.thigh_length + robot.calf_length)
-    return finite & (x[1] > least) & upright
+    height = body.x[1] - (jnp.min(body.feet[:, 1]) - robot.foot_radius)
+    return finite & (height > least) & upright

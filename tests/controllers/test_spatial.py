@@ -129,8 +129,8 @@ def test_it_goes_where_it_is_told_in_c_mujoco(walk):
 
 
 def test_the_batch_engine_walks_it_alike(config, walk):
-    engine = BatchEngine(batch_spec(config), dtype=np.float32, threads=1)
-    batch = engine.run([resolve_episode(config), resolve_episode(config, seed=1)])
+    engine = BatchEngine(batch_spec(config), dtype=np.float32, threads=2)
+    batch = engine.run([resolve_episode(config, seed=seed) for seed in range(4)])
     assert not batch.fell.any()
     single = walk.trajectory(0).qpos[::5]
     # The first steps agree to float32; later the contacts' chaos is larger.
