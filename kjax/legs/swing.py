@@ -186,6 +186,7 @@ def _lift_over(
     Such a foot goes on from where it is, as if it lifted off there: up first. Where one foot met
     something others will, so all swings are higher for a while.
     """
+    assert state.raised is not None
     early = state.elapsed <= params.hold_after * state.duration
     left_ground = state.elapsed > LEAVING * state.duration
     stumbled = flags.blocked & early & left_ground & ~state.held

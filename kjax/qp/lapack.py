@@ -19,7 +19,6 @@ def _one_by_one(function: Callable[..., Array]) -> Callable[..., Array]:
     """The function, which for a batch on a CPU is a loop."""
     whole: Any = custom_vmap(function)
 
-    @whole.def_vmap
     def rule(axis_size: int, in_batched: list[bool], *args: Array) -> tuple[Array, bool]:
         if jax.default_backend() != "cpu":
             axes = [0 if batched else None for batched in in_batched]
@@ -32,6 +31,7 @@ def _one_by_one(function: Callable[..., Array]) -> Callable[..., Array]:
 
         return jax.lax.map(one, rows), True
 
+    whole.def_vmap(rule)
     return whole
 
 

@@ -17,6 +17,7 @@ it is that of one side, and where active rows depend on one another the multipli
 several; ``RowSolution.margin`` tells how near the former is.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -178,10 +179,12 @@ def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
     # step 1; the active set wants curvature everywhere, and needs no other units then
     by_curvature = settings.method in ("auto", "active_set")
     posed = pose(data, good, equilibrate=not by_curvature)
+    more: Callable[..., tuple[Found, Verdict]] = _unsolved
+    args: tuple[Any, ...] = (posed.data, posed.good)
     if settings.method == "interior_point":  # steps 2 and 3
-        found, more, args = by_interior_point(settings, posed), _unsolved, ()
+        found = by_interior_point(settings, posed)
     elif settings.method == "admm":
-        found, more, args = by_splitting(settings, posed, warm), _unsolved, ()
+        found = by_splitting(settings, posed, warm)
     else:
         found, factor = without_rows(posed)
         more, args = _constrained, (posed, factor)
@@ -191,7 +194,7 @@ def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
         _unfinished(settings, found, posed.good),
         partial(more, settings),
         (found, verdict),
-        *(args or (posed.data, posed.good)),
+        *args,
     )
     status = jnp.select(
         [

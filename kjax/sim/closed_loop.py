@@ -18,7 +18,6 @@ from kjax.controllers.controller import build_controller
 from kjax.controllers.params import Tables
 from kjax.controllers.state import ControllerState
 from kjax.legs.base import build_base
-from kjax.legs.kinematics import PlanarState
 from kjax.robots import Robot
 from kjax.sim.episode import BatchSpec, EpisodeParams, SceneSpec
 from kjax.sim.excitation import perturb
@@ -164,7 +163,7 @@ def build_closed_loop(
         true = see(sensed)
         true = true._replace(base_pos=true.base_pos - origin.astype(true.base_pos.dtype))
         body = base.view(tables.params.robot, state.track, true).planar
-        alive = state.alive & standing(tables.params.robot, body, true)
+        alive = state.alive & standing(tables.params.robot, body.x, body.feet, true)
         log = TickLog(
             x=body.x,
             feet=body.feet,
@@ -219,12 +218,21 @@ def delayed_torque(ring: Any, torque: Any, place: Any, delay: Any) -> tuple[Any,
     return ring, ring[(place - delay) % count]
 
 
-def standing(robot: RobotParams, body: PlanarState, observation: Observation) -> Bool[Array, ""]:
-    """Whether the robot has not fallen; not a number is a fall."""
+def standing(
+    robot: RobotParams, x: Float[Array, "6"], feet: Float[Array, "4 d"], observation: Observation
+) -> Bool[Array, ""]:
+    """Whether the robot has not fallen; not a number is a fall.
+
+    Args:
+      robot: its size.
+      x: SRB state.
+      feet: (4, d) foot centres, z last, in the same frame [m].
+      observation: of the robot.
+    """
     w, i, j, k = observation.base_quat
     roll = jnp.arctan2(2.0 * (w * i + j * k), 1.0 - 2.0 * (i * i + j * j))
     finite = jnp.isfinite(observation.joint_pos).all() & jnp.isfinite(observation.joint_vel).all()
-    upright = (jnp.abs(body.x[2]) < FALL_TILT) & (jnp.abs(roll) < FALL_TILT)
+    upright = (jnp.abs(x[2]) < FALL_TILT) & (jnp.abs(roll) < FALL_TILT)
     least = FALL_HEIGHT * (robot.thigh_length + robot.calf_length)
-    height = body.x[1] - (jnp.min(body.feet[:, 1]) - robot.foot_radius)
+    height = x[1] - (jnp.min(feet[:, -1]) - robot.foot_radius)
     return finite & (height > least) & upright

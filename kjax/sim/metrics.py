@@ -42,13 +42,19 @@ def reference_velocity(time: Float[np.ndarray, "N"], goal: Goal) -> Float[np.nda
     wanted = np.asarray(goal.command.values)[:, columns]
     begin = np.asarray(goal.command.times, float)
     rates = goal.slews[[0, 0, 1]]
+    finite = np.where(np.isfinite(rates), rates, 0.0)
+
+    def moved(change: np.ndarray, passed: Any) -> np.ndarray:
+        most = np.where(np.isfinite(rates), finite * passed, np.inf)
+        return np.clip(change, -most, most)
+
     out, before = np.zeros((len(time), 3)), np.zeros(3)
     for piece, (start, end) in enumerate(zip(begin, [*begin[1:], np.inf], strict=True)):
         inside = (time >= start - 1e-9) & (time < end - 1e-9)
         change, passed = wanted[piece] - before, time[inside, None] - start
-        out[inside] = before + np.clip(change, -rates * passed, rates * passed)
+        out[inside] = before + moved(change, passed)
         if np.isfinite(end):
-            before = before + np.clip(change, -rates * (end - start), rates * (end - start))
+            before = before + moved(change, end - start)
     return out
 
 

@@ -25,7 +25,7 @@ def is_up(height, joints, roll=0.0):
         contact=jnp.ones(4, bool),
     )
     body = FREE.view(go1.PARAMS, jnp.array([1.0, 0.0]), seen).planar
-    return bool(standing(go1.PARAMS, body, seen))
+    return bool(standing(go1.PARAMS, body.x, body.feet, seen))
 
 
 @pytest.mark.parametrize("ground", [0.0, -0.5, 0.5])

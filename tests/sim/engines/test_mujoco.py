@@ -148,7 +148,8 @@ def test_a_body_that_lies_tilts_or_is_no_number_has_fallen(height, pitch, roll, 
         base_ang_vel=jnp.zeros(3), joint_pos=zero, joint_vel=zero, contact=jnp.ones(4, bool),
     )  # fmt: skip
     x = jnp.array([0.0, height, pitch, 0.0, 0.0, 0.0])
-    assert bool(standing(go1.PARAMS, x, seen)) == upright
+    feet = jnp.full((4, 2), go1.PARAMS.foot_radius)  # on the ground
+    assert bool(standing(go1.PARAMS, x, feet, seen)) == upright
 
 
 def test_a_trajectory_survives_saving(run, tmp_path):
