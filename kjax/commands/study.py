@@ -14,6 +14,7 @@ STUDIES = {
     "whole_body": "residual models from recordings of the whole robot",
     "model_walks": "what each prediction model walks like, tuned alike",
     "learn_control": "a dictionary learned through the closed loop",
+    "spatial": "in three dimensions: commands, random walks, grounds that it does not see",
     "showreel": "the moving picture of the README: gaits and grounds, one after another",
 }
 _PACKAGES = {"whole_body": "kjax.studies.whole_body.study"}
