@@ -30,6 +30,8 @@ from kjax.types import Observation, RobotParams
 # on the ground, wherever that is.
 FALL_HEIGHT = 0.28
 FALL_TILT = 1.0  # rad, pitch or roll
+# MuJoCo resets a state that is not a number, to joints that no leg can have.
+BEYOND_RANGE = 0.3  # rad
 
 
 class Sensed(NamedTuple):
@@ -235,4 +237,6 @@ def standing(
     upright = (jnp.abs(x[2]) < FALL_TILT) & (jnp.abs(roll) < FALL_TILT)
     least = FALL_HEIGHT * (robot.thigh_length + robot.calf_length)
     height = x[1] - (jnp.min(feet[:, -1]) - robot.foot_radius)
-    return finite & (height > least) & upright
+    low, high = jnp.asarray(robot.joint_range).T
+    beyond = jnp.maximum(low[None] - observation.joint_pos, observation.joint_pos - high[None])
+    return finite & (height > least) & upright & (beyond < BEYOND_RANGE).all()

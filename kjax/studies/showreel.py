@@ -42,12 +42,15 @@ class Clip:
 
 STEADY = {"command.times": [0.0], "lmpc.command_slew": 1.0, "sim.base": "free"}
 CLIPS: tuple[Clip, ...] = (
-    Clip("trot_velocity_long", "trot, 0.6 m/s", 1.5, 4.0, STEADY | {"command.v_x": [0.6]}),
-    Clip("bound_multiphase", "bound, 0.8 m/s", 2.5, 5.0, STEADY | {"command.v_x": [0.8]}),
-    Clip("bound_to_trot", "bound to trot, in flight", 2.0, 4.5, {"sim.base": "free"}),
-    Clip("trot_rough", "trot over blocks of 5 to 7 cm", 4.0, 8.0, {"sim.base": "free"}),
-    Clip("bound_rough", "bound over them", 2.2, 5.2, {"sim.base": "free"}),
-    Clip("pronk", "pronk", 2.0, 4.0, {"sim.base": "free"}),
+    Clip("trot_velocity_long", "trot, 0.6 m/s", 1.5, 3.0, STEADY | {"command.v_x": [0.6]}),
+    Clip("bound_multiphase", "bound, 0.8 m/s", 2.5, 4.5, STEADY | {"command.v_x": [0.8]}),
+    Clip("bound_to_trot", "bound to trot, in flight", 2.2, 4.2, {"sim.base": "free"}),
+    Clip("trot_rough", "trot over blocks of 5 to 7 cm", 4.5, 7.0, {"sim.base": "free"}),
+    Clip("bound_rough", "bound over them", 2.2, 4.7, {"sim.base": "free"}),
+    Clip("omni_trot", "ahead, to the left, turning", 7.5, 9.9),
+    Clip("slope", "a slope of 20 degrees, unseen", 3.4, 5.2),
+    Clip("stairs", "steps of 8 cm, unseen", 4.0, 6.0),
+    Clip("pronk", "pronk", 2.0, 3.2, {"sim.base": "free"}),
 )
 
 

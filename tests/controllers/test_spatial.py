@@ -85,6 +85,22 @@ def test_standing_feet_carry_the_weight_and_undo_what_the_body_does(spatial, tab
     assert (arms[:, 0] * turning[:, 1] - arms[:, 1] * turning[:, 0]).sum() < -0.5
 
 
+def test_planned_forces_keep_to_the_joints_torques(spatial, tables):
+    own = tables.params.spatial
+    falling = disturbed(2)._replace(base_vel=jnp.array([0.3, 0.1, -0.8]))
+
+    def largest(limit):
+        limits = own.limits._replace(torque=jnp.full(3, limit))
+        limited = with_params(tables, spatial=own._replace(limits=limits))
+        state, info = spatial.plan(limited, spatial.init(limited, falling), falling)
+        assert int(info.status) == qp.Status.SOLVED
+        _, joints = spatial.act(limited, state, falling)
+        return np.abs(np.asarray(joints.torque)[np.asarray(state.stance)]).max()
+
+    free = largest(1e6)
+    assert largest(0.8 * free) == pytest.approx(0.8 * free, rel=1e-4)
+
+
 def test_a_batch_equals_single_robots(spatial, tables):
     robots = [disturbed(seed) for seed in range(3)]
     plans = [spatial.plan(tables, spatial.init(tables, o), o)[0].force for o in robots]

@@ -35,3 +35,4 @@ def test_a_robot_stands_or_lies_on_the_ground_that_is_below_it(ground):
     assert not is_up(ground + 0.09, LYING)
     assert not is_up(ground + height, joints, roll=1.2)
     assert not is_up(np.nan, joints)
+    assert not is_up(ground + 0.4, np.zeros((4, 3)))  # MuJoCo's state after a reset

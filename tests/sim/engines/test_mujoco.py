@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kjax.config import RunConfig, SimConfig, load_config
+from kjax.legs.posture import stand_pose
 from kjax.robots import go1
 from kjax.sim.closed_loop import standing
 from kjax.sim.engines.contract import get_engine
@@ -142,10 +143,10 @@ def test_a_fall_ends_the_run_and_is_reported(simulation, episode):
 )
 def test_a_body_that_lies_tilts_or_is_no_number_has_fallen(height, pitch, roll, upright):
     quat = np.array([np.cos(roll / 2), np.sin(roll / 2), 0.0, 0.0])
-    zero = jnp.zeros((4, 3))
+    zero, joints = jnp.zeros((4, 3)), jnp.asarray(stand_pose(go1.PARAMS, 0.27)[1])
     seen = Observation(
         base_pos=jnp.zeros(3), base_quat=jnp.asarray(quat), base_vel=jnp.zeros(3),
-        base_ang_vel=jnp.zeros(3), joint_pos=zero, joint_vel=zero, contact=jnp.ones(4, bool),
+        base_ang_vel=jnp.zeros(3), joint_pos=joints, joint_vel=zero, contact=jnp.ones(4, bool),
     )  # fmt: skip
     x = jnp.array([0.0, height, pitch, 0.0, 0.0, 0.0])
     feet = jnp.full((4, 2), go1.PARAMS.foot_radius)  # on the ground
