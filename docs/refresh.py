@@ -340,7 +340,7 @@ def _as_left(name: str) -> Callable[[], str]:
     return left
 
 
-for _name in ("tune_trot", "tune_bound", "learn_control"):
+for _name in ("tune_trot", "tune_bound", "learn_control", "spatial"):
     table(_as_left(_name))
 
 

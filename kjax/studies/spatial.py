@@ -331,12 +331,18 @@ def figure(record: dict[str, Any], path: Path) -> None:
             ax = axes[0] if ground.unit == "deg" else axes[1]
             scale = 1.0 if ground.unit == "deg" else 100.0
             value = scale * np.array([row["value"] for row in own])
+            # Beside each other, where they would hide one another.
+            kin = [one.name for one in GROUNDS if one.unit == ground.unit]
+            gap = 0.12 * (value[1] - value[0]) if len(value) > 1 else 0.0
+            value += gap * (kin.index(ground.name) - 0.5 * (len(kin) - 1))
             share = 100 * np.array([row["crossed"] / row["episodes"] for row in own])
             ends = 100 * np.array([row["crossed_interval"] for row in own]).T
             ax.errorbar(value, share, np.abs(ends - share), color=colour, marker="o",
                         capsize=3, label=ground.title)  # fmt: skip
         axes[0].set(xlabel="inclination [deg]", ylabel="crossed [% of the seeds]")
         axes[1].set(xlabel="height [cm]")
+        axes[0].set_xticks(_ANGLES)
+        axes[1].set_xticks(100 * np.array(_HEIGHTS))
         for ax in axes:
             ax.set_ylim(-5, 105)
             if ax.get_legend_handles_labels()[0]:
