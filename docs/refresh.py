@@ -330,6 +330,39 @@ def simulation() -> str:
     return markdown(("robot-steps per second, two threads", "closed loop", "bare engine", ""), rows)
 
 
+@table
+def envelope() -> str:
+    """How far the trots and the bound go, planar."""
+    axes = load("envelope", "results.json")["axes"]
+    gaits = ("trot", "flying_trot", "bound")
+
+    def cell(quantity: str, gait: str) -> str:
+        found = axes.get(f"{quantity}_{gait}_planar")
+        if found is None:
+            return ""
+        if found["passed"] is None:
+            return f"< {found['easy']:.3g}"
+        text = f"{found['passed']:.3g}"
+        if found["failed"] is None:
+            text = f"{text}, the end of the search"
+        if found.get("reached_mps") is not None:
+            text += f" (reaches {found['reached_mps']:.3g})"
+        return text
+
+    return markdown(
+        ("limit, 95 % of 20 seeds get through (planar)", "trot", "flying trot", "bound"),
+        [
+            (text, *(cell(quantity, gait) for gait in gaits))
+            for quantity, text in (
+                ("speed", "fastest [m/s]"),
+                ("blocks", "highest blocks [m]"),
+                ("push", "forward push at the weakest of seven phases [N s]"),
+                ("friction", "slipperiest ground, friction [-]"),
+            )
+        ],
+    )
+
+
 def _as_left(name: str) -> Callable[[], str]:
     """The table of a study, as its command leaves it."""
 

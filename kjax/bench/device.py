@@ -4,6 +4,7 @@ Each kind of device has a process of its own, since JAX chooses one for all that
 lie on the device, and results are waited for.
 """
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -24,6 +25,8 @@ from kjax.bench.edmd import data as edmd_data
 from kjax.bench.options import BenchOptions
 from kjax.bench.simulation import benchmark as simulation
 from kjax.bench.timing import elapsed
+from kjax.config import RunConfig, load_config
+from kjax.config.shipped import shipped_config
 from kjax.controllers.controller import build_controller
 from kjax.controllers.params import condense
 from kjax.koopman import edmd
@@ -36,18 +39,22 @@ from kjax.viz.tables import markdown_table
 
 SIZES = {"cpu": (1024, 16384), "gpu": (1024, 16384, 131072)}  # robots, QPs
 MJX_SIZES = {"cpu": (1024,), "gpu": (1024, 4096, 8192)}
+SPATIAL_SIZES = {"cpu": (1024,), "gpu": (1024, 16384)}
 ROUNDS = 5
 VARIABLES = 24  # of the random QPs, as many as the trot's have
 SNAPSHOTS = 10_000_000
-PARTS: Final = ("controller", "qp", "edmd", "mjx")
+PARTS: Final = ("controller", "qp", "edmd", "mjx", "spatial", "mjx_spatial")
 
 
 @dataclass(kw_only=True)
 class DeviceOptions(BenchOptions):
     """Options of this benchmark."""
 
-    parts: tuple[Literal["controller", "qp", "edmd", "mjx"], ...] = PARTS
-    """What is measured."""
+    parts: tuple[Literal["controller", "qp", "edmd", "mjx", "spatial", "mjx_spatial"], ...] = PARTS
+    """What is measured: of the planar controller and of the spatial one, each alone and on MJX."""
+
+    kinds: tuple[Literal["cpu", "gpu"], ...] = ()
+    """Kinds of device; all that this machine has if left out."""
 
 
 OPTIONS = DeviceOptions
@@ -56,6 +63,7 @@ OPTIONS = DeviceOptions
 def run(folder: Path, args: DeviceOptions) -> dict[str, Any]:
     """All measurements on each kind of device; leaves figure.png and table.md in the folder."""
     kinds = ["cpu"] if jax.default_backend() == "cpu" else ["gpu", "cpu"]
+    kinds = [kind for kind in kinds if not args.kinds or kind in args.kinds]
     result: dict[str, Any] = {"devices": {}}
     for kind in kinds:
         for part in args.parts:
@@ -91,13 +99,32 @@ def measure(kind: str, part: str, quick: bool) -> dict[str, Any]:
     """One part on the device of this process."""
     sizes = SIZES[kind][:1] if quick else SIZES[kind]
     named = {"name": jax.devices()[0].device_kind, "cores": os.cpu_count()}
-    if part == "mjx":
+    if part in ("mjx", "mjx_spatial"):
         walks = MJX_SIZES[kind][:1] if quick else MJX_SIZES[kind]
-        return named | {"mjx": {str(n): mjx_walks(n) for n in walks}}
+        return named | {part: {str(n): mjx_walks(part, n) for n in walks}}
+    if part == "spatial":
+        sizes = SPATIAL_SIZES[kind][:1] if quick else SPATIAL_SIZES[kind]
     if part == "edmd":
         return named | {"edmd": data_and_fit(SNAPSHOTS // (100 if quick else 1))}
-    one = {"controller": controller, "qp": box_qps}[part]
-    return named | {part: {str(n): one(n) for n in sizes}}
+    if part == "qp":
+        return named | {part: {str(n): box_qps(n) for n in sizes}}
+    return named | {part: {str(n): controller(part, n) for n in sizes}}
+
+
+def _walks(part: str, robots: int) -> list[RunConfig]:
+    """Configs of the planar controller's trot, or of the spatial one's, turning and sideways."""
+    duration = simulation.EPISODE_MJX
+    if "spatial" not in part:
+        return simulation.cases("trot", robots, duration)
+    config = load_config(
+        RunConfig,
+        shipped_config("omni_trot"),
+        {
+            "gait.also": [], "duration": duration, "sim.contacts": "feet", "command.times": [0.0],
+            "command.v_x": [0.5], "command.v_y": [0.2], "command.yaw_rate": [0.5],
+        },
+    )  # fmt: skip
+    return [dataclasses.replace(config, seed=seed) for seed in range(robots)]
 
 
 def _rate(call: Callable[[], Any], per_call: int) -> dict[str, float]:
@@ -107,10 +134,9 @@ def _rate(call: Callable[[], Any], per_call: int) -> dict[str, float]:
     return {"per_s": per_call / seconds, "seconds": seconds, "compile_s": first - seconds}
 
 
-def controller(robots: int) -> dict[str, float]:
+def controller(part: str, robots: int) -> dict[str, float]:
     """Control ticks per second: one plan and the joint torques of its five samples, per robot."""
-    config = simulation.cases("trot", 1, 1.0)[0]
-    episode = resolve_episode(config)
+    episode = resolve_episode(_walks(part, 1)[0])
     engine = MujocoEngine(episode.spec)
     qpos, qvel = initial_state(episode.start, engine.model, engine.addresses)
     sensors = jnp.zeros(engine.model.nsensordata)
@@ -171,9 +197,9 @@ def data_and_fit(snapshots: int) -> dict[str, Any]:
     return {"snapshots": count, "draw": drawing, "fit": _rate(lambda: fit(drawn), count)}
 
 
-def mjx_walks(robots: int) -> dict[str, float]:
+def mjx_walks(part: str, robots: int) -> dict[str, float]:
     """Closed loops on MJX: robot-steps per second, and what the host does before and after."""
-    episodes = resolve_episodes(simulation.cases("trot", robots, simulation.EPISODE_MJX))
+    episodes = resolve_episodes(_walks(part, robots))
     engine = MjxEngine(episodes[0].spec)
     recordings, whole = [], []
     for _ in range(3):
@@ -191,7 +217,14 @@ def mjx_walks(robots: int) -> dict[str, float]:
     }
 
 
-UNITS = {"controller": "ticks", "qp": "QPs", "mjx": "robot-steps"}
+UNITS = {
+    "controller": "ticks", "qp": "QPs", "mjx": "robot-steps", "spatial": "ticks",
+    "mjx_spatial": "robot-steps",
+}  # fmt: skip
+NAMES = {
+    "controller": "planar controller", "qp": "box QPs", "mjx": "planar trots on MJX",
+    "spatial": "spatial controller", "mjx_spatial": "spatial trots on MJX",
+}  # fmt: skip
 
 
 def table(result: dict[str, Any]) -> str:
@@ -200,7 +233,7 @@ def table(result: dict[str, Any]) -> str:
     for kind, entry in result["devices"].items():
         name = f"{entry['cores']} cores" if kind == "cpu" else entry["name"]
         lines = [
-            (f"{part}, batch of {int(size):,}", found, UNITS[part])
+            (f"{NAMES[part]}, batch of {int(size):,}", found, UNITS[part])
             for part in UNITS
             for size, found in _found(entry, part).items()
         ]
@@ -225,16 +258,18 @@ def figure(result: dict[str, Any], path: Path) -> None:
     """Rates against the size of the batch, a line per device."""
     fig, axes = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
     titles = {
-        "controller": "control ticks/s (plan + 5 act)",
-        "qp": f"box QPs/s, {VARIABLES} variables",
-        "mjx": "robot-steps/s on MJX",
+        "control ticks/s (plan + 5 act)": ("controller", "spatial"),
+        f"box QPs/s, {VARIABLES} variables": ("qp",),
+        "robot-steps/s on MJX": ("mjx", "mjx_spatial"),
     }
-    for ax, (part, title) in zip(axes, titles.items(), strict=True):
+    for ax, (title, parts) in zip(axes, titles.items(), strict=True):
         for kind, entry in result["devices"].items():
-            points = _found(entry, part)
             name = f"{entry['cores']} cores" if kind == "cpu" else entry["name"]
-            rates = [found["per_s"] for found in points.values()]
-            ax.loglog([int(size) for size in points], rates, "o-", label=name)
+            for part, line in zip(parts, ("o-", "s--"), strict=False):
+                points = _found(entry, part)
+                rates = [found["per_s"] for found in points.values()]
+                own = f"{name}, spatial" if "spatial" in part else name
+                ax.loglog([int(size) for size in points], rates, line, label=own)
         ax.set(xlabel="batch", title=title)
     axes[0].legend()
     fig.savefig(path)

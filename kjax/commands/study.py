@@ -14,10 +14,13 @@ STUDIES = {
     "whole_body": "residual models from recordings of the whole robot",
     "model_walks": "what each prediction model walks like, tuned alike",
     "learn_control": "a dictionary learned through the closed loop",
-    "spatial": "in three dimensions: commands, random walks, grounds that it does not see",
+    "spatial": "in three dimensions: commands, grounds unseen, pushes, speeds, switches",
     "showreel": "the moving picture of the README: gaits and grounds, one after another",
 }
-_PACKAGES = {"whole_body": "kjax.studies.whole_body.study"}
+_PACKAGES = {
+    "whole_body": "kjax.studies.whole_body.study",
+    "spatial": "kjax.studies.spatial.study",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

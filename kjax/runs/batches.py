@@ -13,8 +13,7 @@ from tqdm import tqdm
 from kjax.config import RunConfig
 from kjax.runs.cache import Cache
 from kjax.runs.pool import Record
-from kjax.sim.engines.contract import Torques
-from kjax.sim.engines.mujoco_batch import BatchEngine
+from kjax.sim.engines.contract import Engine, Torques, get_engine
 from kjax.sim.resolve import batch_spec, resolve_episodes
 from kjax.sim.trajectory import Trajectory
 
@@ -27,10 +26,11 @@ def batch_key(
     torques: Torques,
     dtype: Any = np.float64,
     measure: Measure | None = None,
+    engine: str = "mujoco_batch",
 ) -> str:
     """Key of an episode's result in the cache."""
     more = [] if measure is None else [measure.__name__]
-    return cache.key(config, "batch", torques, np.dtype(dtype).name, *more)
+    return cache.key(config, "batch", engine, torques, np.dtype(dtype).name, *more)
 
 
 def run_batch(
@@ -44,11 +44,12 @@ def run_batch(
     recorded: int = 0,
     measure: Measure | None = None,
     dtype: Any = np.float64,
+    engine: str = "mujoco_batch",
     label: str = "",
 ) -> list[dict[str, Any]]:
     """Metrics of the episodes, in order; what the cache holds is not run again.
 
-    Ten arguments: what is run and where it is kept, and options by keyword.
+    Eleven arguments: what is run and where it is kept, and options by keyword.
 
     Args:
       cache: of results.
@@ -60,19 +61,20 @@ def run_batch(
       recorded: for the first so many configs.
       measure: metrics of a run besides the usual ones; the cache must know its file.
       dtype: floating type of the controller.
+      engine: whose physics; a name of ``sim.engines``.
       label: of the progress bar.
 
     Raises:
       KeyboardInterrupt: on Ctrl-C; finished chunks are kept.
     """
-    keys = [batch_key(cache, config, torques, dtype, measure) for config in configs]
+    keys = [batch_key(cache, config, torques, dtype, measure, engine) for config in configs]
     files = [cache.path(key, ".npz") for key in keys]
     kept = recorded if record is not None else 0
     missing = [
         number for number, key in enumerate(keys)
         if key not in cache or (number < kept and not files[number].exists())
     ]  # fmt: skip
-    engine: BatchEngine | None = None
+    walker: Engine | None = None
     size = min(chunk, len(missing))
     with tqdm(
         total=len(configs), initial=len(configs) - len(missing), desc=label, unit="episode",
@@ -80,12 +82,14 @@ def run_batch(
     ) as bar:  # fmt: skip
         for first in range(0, len(missing), max(size, 1)):
             some = missing[first : first + size]
-            if engine is None:
-                spec = batch_spec(configs[0])
-                engine = BatchEngine(spec, torques=torques, threads=threads, dtype=dtype)
+            if walker is None:
+                build = get_engine(engine)
+                walker = build(
+                    batch_spec(configs[0]), torques=torques, threads=threads, dtype=dtype
+                )
             # All chunks have one number of robots, so that one compilation serves them.
             padded = [configs[number] for number in [*some, *[some[-1]] * (size - len(some))]]
-            recording = engine.run(resolve_episodes(padded))
+            recording = walker.run(resolve_episodes(padded))
             if recording.interrupted:
                 raise KeyboardInterrupt
             for robot, number in enumerate(some):
