@@ -203,7 +203,7 @@ class SpatialConfig:
     force: Annotated[Positive, COST, INPUT_COST] = 0.0781
     """Weight of every squared force's distance from the gait's mean force [1/(m g)^2]."""
     friction: Annotated[float, Field(ge=0.05)] = 0.6
-    """mu of the pyramids |F_x|, |F_y| <= mu F_z; below the ground's, for margin [-]."""
+    """mu of the friction cones, as pyramids of eight sides; below the ground's, for margin [-]."""
     torque_fraction: TorqueFraction = 0.95
     """Part of the joint torque limits that stance forces may take; inf: any [-]."""
     grf_z_min: Annotated[Bound, MIN_GRF, FORCE] = 0.04

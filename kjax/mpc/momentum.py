@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax import qp
@@ -25,6 +26,9 @@ from kjax.dynamics.rotations import skew
 from kjax.dynamics.srb_spatial import BodyState, Contacts, SpatialBody
 from kjax.mpc.grid import FootNodes, Grid
 
+# Of the pyramid in place of the friction cone. At a corner it allows 1 / cos(pi / SIDES) times the
+# cone's friction: 1.08, where that with four sides allows 1.41 and the feet slip on a diagonal.
+SIDES = 8
 STATE = 12  # numbers of this model's x, and of the errors that the cost weighs
 
 
@@ -70,7 +74,7 @@ class Limits(NamedTuple):
     """What a foot may press, and a leg's joints may bear.
 
     Attributes:
-      friction: mu of the pyramid [-].
+      friction: mu of the cone [-].
       force_z: (2,) bounds of F_z [N].
       torque: (3,) bounds of the joints' torques [N m].
     """
@@ -279,22 +283,24 @@ def foot_rows(
     axes: Float[Array, "3 3"],
     torques: Float[Array, "K 4 3 3"],
 ) -> FootRows:
-    """Rows of friction pyramids and joint torques.
+    """Rows of friction cones, pyramids of ``SIDES`` sides about the circle, and of joint torques.
 
     Args:
       limits: of both.
-      axes: of the pyramids in its columns, the third one the ground's normal [-].
+      axes: of the cones in its columns, the third one the ground's normal [-].
       torques: (K, 4, 3, 3) torque of each joint per force of its foot, world [m].
     """
     mu = limits.friction
-    one, zero = jnp.ones_like(mu), jnp.zeros_like(mu)
-    sides = ((one, zero), (-one, zero), (zero, one), (zero, -one))
-    pyramid = jnp.stack([jnp.stack([*side, -mu]) for side in sides]) @ axes.T
-    most = jnp.concatenate([jnp.zeros_like(mu, shape=(4,)), limits.torque])
-    pyramids = jnp.broadcast_to(pyramid, (*torques.shape[:2], 4, 3))
+    angles = np.arange(SIDES) * 2 * np.pi / SIDES
+    sides = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    cone = jnp.concatenate(
+        [jnp.asarray(sides, mu.dtype), jnp.broadcast_to(-mu, (SIDES, 1))], axis=-1
+    )
+    most = jnp.concatenate([jnp.zeros_like(mu, shape=(SIDES,)), limits.torque])
+    cones = jnp.broadcast_to(cone @ axes.T, (*torques.shape[:2], SIDES, 3))
     return FootRows(
-        matrix=jnp.concatenate([pyramids, torques], axis=2),
-        low=jnp.concatenate([jnp.full_like(mu, -jnp.inf, shape=(4,)), -limits.torque]),
+        matrix=jnp.concatenate([cones, torques], axis=2),
+        low=jnp.concatenate([jnp.full_like(mu, -jnp.inf, shape=(SIDES,)), -limits.torque]),
         high=most,
         force_z=limits.force_z,
     )

@@ -133,7 +133,7 @@ def test_plans_about_plans_end_at_a_minimum_of_the_nonlinear_cost(which):
 
 def test_forces_keep_to_cone_and_bounds():
     start, found, feet, nominal = problem(6)
-    start = start._replace(v=jnp.array([-1.5, 0.8, 0.0]))
+    start = start._replace(v=jnp.array([-1.2, 1.2, 0.0]))
     listed = grid.list_feet(found.stance, 24)
     rng = np.random.default_rng(7)
     torques = jnp.asarray(0.2 * rng.normal(size=(len(found.length), 4, 3, 3)))
@@ -151,8 +151,9 @@ def test_forces_keep_to_cone_and_bounds():
     x, y, z = np.moveaxis(np.asarray(solved.force)[np.asarray(found.stance)], -1, 0)
     assert z.min() >= 5.0 - 1e-6
     assert z.max() <= 90.0 + 1e-6
-    assert (np.abs(x) <= 0.4 * z + 1e-6).all()
-    assert (np.abs(y) <= 0.4 * z + 1e-6).all()
-    assert (np.abs(x) > 0.4 * z - 1e-6).any()  # it brakes as hard as it may
+    # Eight sides about the circle, whatever the direction: a pyramid of four allows 1.41.
+    part = np.hypot(x, y) / (0.4 * z)
+    assert part.max() <= 1.0 / np.cos(np.pi / 8) + 1e-6
+    assert part.max() >= 1.0 - 1e-6  # it brakes as hard as it may
     torque = np.abs(np.einsum("klij,klj->kli", torques, solved.force))
     assert torque.max() == pytest.approx(13.0, abs=1e-5)
