@@ -212,6 +212,9 @@ class SpatialConfig:
     """Upper bound of F_z per leg [m g]."""
     yaw_slew: Positive = 8.0
     """Largest rate at which the reference yaw rate follows the command [rad/s^2]."""
+    velocity_slack: Positive = 0.5
+    """Largest lead of the velocity's reference before the robot, ahead and to the left: after a
+    push the way back is no faster [m/s]."""
     heading_slack: Positive = 0.3
     """Largest lead or lag of the heading's reference before the trunk [rad]."""
     integral_gains: Annotated[Three, RATE] = (0.5, 0.5, 0.5)

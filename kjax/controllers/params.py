@@ -47,6 +47,7 @@ class SpatialParams(NamedTuple):
       grid: (2,) length of the horizon, and longest node where two feet stand [s].
       force_z: (G, 2) mean vertical force of a front and a rear leg in its stance [N].
       slew: of the reference yaw rate [rad/s^2].
+      velocity_slack: clamp of the velocity reference's lead [m/s].
       heading_slack: clamp of the heading reference's lead [rad].
       velocity_time: in which the velocity is predicted to reach its reference [s].
       integral: (2, 3) integral action on v_x, v_y and heading: its rates [1/s] and its limits
@@ -61,6 +62,7 @@ class SpatialParams(NamedTuple):
     grid: Float[Array, "2"]
     force_z: Float[Array, "G 2"]
     slew: Float[Array, ""]
+    velocity_slack: Float[Array, ""]
     heading_slack: Float[Array, ""]
     velocity_time: Float[Array, ""]
     integral: Float[Array, "2 3"]

@@ -64,6 +64,7 @@ def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> 
         grid=stacked([own.horizon, own.node_dt]),
         force_z=mean_force(gaits, config, robot),
         slew=_floats(own.yaw_slew),
+        velocity_slack=_floats(own.velocity_slack),
         heading_slack=_floats(own.heading_slack),
         velocity_time=_floats(own.velocity_time),
         integral=stacked([own.integral_gains, own.integral_limits]),

@@ -197,6 +197,9 @@ def _next_motion(
     ahead = _wrapped(state.heading + reference[2] * control_dt - yaw)
     ahead = jnp.clip(ahead, -own.heading_slack, own.heading_slack)
     heading = _wrapped(yaw + ahead)
+    moving = turned(-heading, velocity[:2])
+    near = jnp.clip(reference[:2] - moving, -own.velocity_slack, own.velocity_slack)
+    reference = jnp.append(moving + near, reference[2])
     lead = velocity[:2] - turned(heading, reference[:2])
     # Errors in the axes of the trunk, where what causes them stays.
     error = jnp.append(turned(-heading, -lead), ahead)

@@ -64,6 +64,19 @@ def test_neither_place_nor_heading_at_the_start_matters(spatial, tables, yaw, sh
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-6)  # the QP's tolerance
 
 
+def test_after_a_push_the_reference_is_no_further_ahead_than_its_slack(spatial, tables):
+    seen = disturbed(0, scale=0.0)._replace(contact=jnp.ones(4, bool))
+    still = with_params(tables, command=tables.params.command.hold())
+    state = spatial.init(still, seen)
+    slack = float(tables.params.spatial.velocity_slack)
+    for pushed, ahead in (((-1.2, 0.9, 0.0), (slack, -slack)), ((0.3, -0.2, 0.0), (-0.3, 0.2))):
+        hit = seen._replace(base_vel=jnp.asarray(pushed))
+        planned, info = spatial.plan(still, state, hit)
+        came, wanted = (np.asarray(values)[9:11] for values in (info.x, info.reference))
+        np.testing.assert_allclose(wanted - came, ahead, atol=0.01)
+        assert np.isfinite(planned.force).all()
+
+
 def test_standing_feet_carry_the_weight_and_undo_what_the_body_does(spatial, tables):
     seen = disturbed(0, scale=0.0)._replace(contact=jnp.ones(4, bool))
     still = with_params(tables, command=tables.params.command.hold())

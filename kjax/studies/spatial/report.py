@@ -74,6 +74,7 @@ def _draw_pushes(ax: Any, rows: list[Row]) -> None:
             continue  # a quick check has one direction
         ax.plot(angles, [*each, each[0]], color=colour, marker="o", label=gait)
     ax.set_theta_zero_location("N")
+    ax.set_thetagrids(DIRECTIONS, ["ahead", "", "left", "", "behind", "", "right", ""])
     ax.set_rlim(0.0)
     ax.set_title("push at the weakest phase [N s]", pad=16)
     if ax.get_legend_handles_labels()[0]:

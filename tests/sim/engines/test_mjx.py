@@ -42,23 +42,27 @@ def configs():
     ]
 
 
-@pytest.fixture(scope="module")
-def engine(configs):
-    """An engine whose contact solver converges.
+def converging(scene):
+    """The scene with a contact solver that converges.
 
     After the 6 iterations of the engine's own scene, and at a tolerance of 1e-8, C and MJX
     stop at different points: robot 1 meets its block in a contact that is 3e-8 apart then.
     """
+    spec = mjx_engine.build_spec(go1.ROBOT, scene, visual=False)
+    spec.option.iterations = spec.option.ls_iterations = 50
+    spec.option.tolerance, spec.option.ls_tolerance = 1e-15, 1e-6
+    return spec.compile()
 
-    def converging(scene):
-        spec = mjx_engine.build_spec(go1.ROBOT, scene, visual=False)
-        spec.option.iterations = spec.option.ls_iterations = 50
-        spec.option.tolerance, spec.option.ls_tolerance = 1e-15, 1e-6
-        return spec.compile()
 
+def converging_engine(config):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mjx_engine, "build_model", converging)
-        return mjx_engine.MjxEngine(batch_spec(configs[0]), dtype=np.float64)
+        return mjx_engine.MjxEngine(batch_spec(config), dtype=np.float64)
+
+
+@pytest.fixture(scope="module")
+def engine(configs):
+    return converging_engine(configs[0])
 
 
 def closest_segment_point(a, b, point):
@@ -134,6 +138,27 @@ def test_other_seeds_and_worlds_do_not_compile_again(engine, both, configs):
     again = engine.run(resolve_episodes(other))
     assert engine.traces == 1
     assert not np.array_equal(again.qpos[-1, 0], both[0].qpos[-1, 0])
+
+
+@pytest.mark.slow
+def test_the_controller_in_three_dimensions_walks_alike():
+    own = {
+        "controller": "spatial", "sim.contacts": "feet", "duration": 0.3, "gait.also": [],
+        "gaits.trot.period": 0.4, "spatial.horizon": 0.1, "command.times": [0.0],
+        "command.v_x": [0.4], "command.v_y": [0.2], "command.yaw_rate": [1.0],
+    }  # fmt: skip
+    config = load_config(RunConfig, None, own)
+    episodes = resolve_episodes([config, dataclasses.replace(config, seed=1)])
+    engine = converging_engine(config)
+    in_c = BatchEngine(batch_spec(config), dtype=np.float64, threads=1)
+    in_c.model = engine.model
+    on_mjx, in_c = engine.run(episodes), in_c.run(episodes)
+    np.testing.assert_allclose(on_mjx.qpos, in_c.qpos, atol=1e-8)
+    np.testing.assert_allclose(on_mjx.torque, in_c.torque, atol=1e-5)
+    np.testing.assert_array_equal(on_mjx.log.stance, in_c.log.stance)
+    np.testing.assert_array_equal(on_mjx.log.status, in_c.log.status)
+    assert not on_mjx.fell.any()
+    assert (on_mjx.qvel[-1, :, 0] > 0.15).all()  # it has set out
 
 
 def test_mjx_refuses_what_it_cannot_simulate():
