@@ -15,6 +15,7 @@ STUDIES = {
     "model_walks": "what each prediction model walks like, tuned alike",
     "learn_control": "a dictionary learned through the closed loop",
     "spatial": "in three dimensions: commands, grounds unseen, pushes, speeds, switches",
+    "spatial_models": "which models of the body in three dimensions predict how far",
     "showreel": "the moving picture of the README: gaits and grounds, one after another",
 }
 _PACKAGES = {
