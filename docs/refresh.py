@@ -373,7 +373,7 @@ def _as_left(name: str) -> Callable[[], str]:
     return left
 
 
-for _name in ("tune_trot", "tune_bound", "learn_control", "spatial"):
+for _name in ("tune_trot", "tune_bound", "learn_control", "spatial", "spatial_models"):
     table(_as_left(_name))
 
 

@@ -39,6 +39,10 @@ AT = (2, 4, 8)  # nodes after which errors are taken
 LEGS = {"trot": (0, 3), "stand": (0, 1, 2, 3)}
 HEIGHT = 0.27  # m, of the centre of mass above the feet
 FORCE_ERROR = 0.2  # of the plan that the last model is linearised about
+_BRIEF = {  # where the rows of the table lean on the one before
+    "edmd_wrench": "linear EDMD, wrench of the measured feet",
+    "momentum_plan": "momentum, about a plan with 20 % force error",
+}
 # Names and titles of the models, in the order of the table.
 TITLES = {
     "hold": "hold the state",
@@ -406,7 +410,7 @@ def figure(record: dict[str, Any], path: Path) -> None:
             points = found[name]["attitude_deg"]
             time = [1e3 * one["time_s"] for one in points]
             ax.semilogy(time, [one["median"] for one in points], style, color=colour,
-                        label=TITLES[name])  # fmt: skip
+                        label=_BRIEF.get(name, TITLES[name]))  # fmt: skip
         ax.set(xlabel="time that is predicted [ms]", ylabel="error of the attitude [deg]")
         ax.legend(fontsize="small")
         ratio = last["convex"] / last["momentum_plan"]
