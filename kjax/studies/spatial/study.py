@@ -8,7 +8,7 @@ robot in a loop of its own in C. Paper: its profiles, and its field with any hea
 
 Leaves results.json, table.md and figure.png of these parts in the output folder. Every finished
 batch is kept there: the same command goes on after Ctrl-C. A second of a robot takes about 0.1 s of
-two cores: random walks and pushes take an hour or more each.
+two cores, several times as much where rows are active: random walks and pushes take hours.
 """
 
 from collections.abc import Sequence
