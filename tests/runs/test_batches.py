@@ -14,7 +14,7 @@ from kjax.runs.cache import Cache
 @pytest.fixture
 def calls(monkeypatch):
     """Seeds that the stand-in engine walked, chunk by chunk; it stops at the chunk ``stop_at``."""
-    log = SimpleNamespace(chunks=[], engines=[], stop_at=None)
+    log = SimpleNamespace(chunks=[], engines=[], names=[], stop_at=None)
 
     class Engine:
         def __init__(self, spec, *, torques, threads, dtype):
@@ -30,7 +30,11 @@ def calls(monkeypatch):
                 interrupted=stopped, metrics=lambda: iter(rows), trajectory=lambda i: rows[i]
             )
 
-    monkeypatch.setattr(batches, "BatchEngine", Engine)
+    def get_engine(name):
+        log.names.append(name)
+        return Engine
+
+    monkeypatch.setattr(batches, "get_engine", get_engine)
     return log
 
 
@@ -68,6 +72,14 @@ def test_ctrl_c_keeps_finished_chunks_and_the_same_call_goes_on(cache, configs, 
     calls.chunks.clear()
     batches.run_batch(again, configs, torques="held", chunk=3)
     assert calls.chunks == []
+
+
+def test_what_one_engine_walked_is_no_result_of_another(cache, configs, calls):
+    batches.run_batch(cache, configs[:2], torques="held")
+    batches.run_batch(cache, configs[:2], torques="held", engine="mjx")
+    batches.run_batch(cache, configs[:2], torques="held", engine="mjx")
+    assert calls.names == ["mujoco_batch", "mjx"]
+    assert calls.chunks == [[0, 1], [0, 1]]
 
 
 def test_torques_held_and_at_every_step_are_other_episodes(cache, configs, calls):
