@@ -2,11 +2,11 @@
 
     python experiments/spatial_models.py
 
-``--help`` lists the options; the program is ``kjax.studies.spatial_models``.
+``--help`` lists the options; the program is ``kjax.studies.spatial_models.study``.
 """
 
 from kjax import cli
-from kjax.studies.spatial_models import main
+from kjax.studies.spatial_models.study import main
 
 if __name__ == "__main__":
     cli.run(main)

@@ -21,6 +21,7 @@ STUDIES = {
 _PACKAGES = {
     "whole_body": "kjax.studies.whole_body.study",
     "spatial": "kjax.studies.spatial.study",
+    "spatial_models": "kjax.studies.spatial_models.study",
 }
 
 

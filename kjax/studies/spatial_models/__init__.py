@@ -1,0 +1,1 @@
+"""Which models of the rigid body in three dimensions predict how far."""
