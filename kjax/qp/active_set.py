@@ -4,6 +4,9 @@ With N the normals of the active rows, each pointing inwards, two matrices are k
 
     P = H^-1 - H^-1 N U,    U = (N^T H^-1 N)^-1 N^T H^-1.
 
+Normals of active rows are independent, so n slots hold whatever rows are active: U has a row per
+slot, zero where it is empty.
+
 1. Start from the unconstrained minimiser, no row active.
 2. Choose the most violated row, normal a; without one, go to step 5.
 3. Ratio test: x moves along P a and the multipliers of the active rows by -U a, until the row
@@ -37,24 +40,32 @@ class ActiveSet(NamedTuple):
     """Iterate of the method; M = m + n rows, those of the box last.
 
     Attributes:
-      stack: (n + M, n) P, and U with a row per row of the problem, zero where not active.
+      stack: (2 n, n) P, and U with a row per slot.
+      slot_row: (n,) row that a slot holds, M where it is empty.
+      slot_equal: (n,) whether that is an equation.
       x: (n,) point.
-      y: (M,) multipliers along the inward normals, not negative but for equations.
+      value: (M,) of the rows at x.
+      y: (n,) multipliers of the slots along the inward normals, not negative but for equations.
       bound_status: (M,) 1 active at the lower side, -1 at the upper one, 0 not active.
       chosen: row to add.
       sign: of its inward normal.
+      y_chosen: its multiplier so far, above 0 if a row was dropped on the way.
       pending: whether there is one.
       infeasible: whether the chosen row cannot be made to hold.
       rounds: of steps 2 to 5.
       iterations: rows added and dropped.
     """
 
-    stack: Float[Array, "n+M n"]
+    stack: Float[Array, "2*n n"]
+    slot_row: Int[Array, "n"]
+    slot_equal: Bool[Array, "n"]
     x: Float[Array, "n"]
-    y: Float[Array, "M"]
+    value: Float[Array, "M"]
+    y: Float[Array, "n"]
     bound_status: Float[Array, "M"]
     chosen: Array
     sign: Array
+    y_chosen: Array
     pending: Array
     infeasible: Array
     rounds: Int[Array, ""]
@@ -63,7 +74,11 @@ class ActiveSet(NamedTuple):
     @property
     def multipliers(self) -> Float[Array, "M"]:
         """Multipliers (M,) of the rows, positive at upper sides."""
-        return -self.bound_status * self.y
+        return -self.bound_status * self.spread(self.y)
+
+    def spread(self, slots: Float[Array, "n"]) -> Float[Array, "M"]:
+        """Numbers (M,) of the rows, 0 where not active, from those of the slots."""
+        return jnp.zeros_like(self.value).at[self.slot_row].add(slots, mode="drop")
 
 
 class _Settings(NamedTuple):
@@ -135,13 +150,18 @@ def solve_active_set(
     half = inverse_of_lower(factor.L)
     inverse = half.T @ half / factor.curvature
     zero = jnp.zeros((), jnp.int32)
+    x = -(inverse @ problem.q)
     state = ActiveSet(  # step 1
-        stack=jnp.concatenate([inverse, jnp.zeros((M, n), dtype)]),
-        x=-(inverse @ problem.q),
-        y=jnp.zeros((M,), dtype),
+        stack=jnp.concatenate([inverse, jnp.zeros((n, n), dtype)]),
+        slot_row=jnp.full((n,), M, jnp.int32),
+        slot_equal=jnp.zeros((n,), bool),
+        x=x,
+        value=problem.rows(x),
+        y=jnp.zeros((n,), dtype),
         bound_status=jnp.zeros((M,), dtype),
         chosen=zero,
         sign=jnp.ones((), dtype),
+        y_chosen=jnp.zeros((), dtype),
         pending=good & factor.definite,
         infeasible=jnp.zeros((), bool),
         rounds=zero,
@@ -167,8 +187,8 @@ def farkas(problem: RowProblem, state: ActiveSet) -> Float[Array, "M"]:
     The chosen normal is the sum of r times active ones, none of which may give way.
     """
     n = problem.q.shape[0]
-    is_chosen = jnp.arange(state.y.shape[0]) == state.chosen
-    r = state.stack[n:] @ (state.sign * problem.adjoint(is_chosen.astype(problem.q.dtype)))
+    is_chosen = jnp.arange(state.value.shape[0]) == state.chosen
+    r = state.spread(state.stack[n:] @ (state.sign * problem.normal(state.chosen)))
     given = jnp.where(problem.equal, r, jnp.minimum(r, 0.0))
     return state.bound_status * given - jnp.where(is_chosen, state.sign, 0.0)
 
@@ -194,7 +214,7 @@ def _round(settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _S
         found,
         problem,
     )
-    fine = found._replace(x=x, y=y, rounds=state.rounds + 1, pending=more)
+    fine = found._replace(x=x, value=problem.rows(x), y=y, rounds=state.rounds + 1, pending=more)
     fine = _choose(settings, fine, problem, sizes)
     # What has finished stays as it is. Its stack, the bulk of it, has not been touched.
     kept = jax.tree.map(
@@ -207,7 +227,7 @@ def _round(settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _S
 
 def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _Sizes) -> ActiveSet:
     """Step 2: the row that is violated most."""
-    value = problem.rows(state.x)
+    value = state.value
     inactive = state.bound_status == 0
     low, high = problem.has_low | problem.equal, problem.has_high | problem.equal
     below = jnp.where(low & inactive, problem.low - value, -jnp.inf)
@@ -235,6 +255,7 @@ def _choose(settings: _Settings, state: ActiveSet, problem: RowProblem, sizes: _
     return state._replace(
         chosen=jnp.where(state.infeasible, state.chosen, chosen),
         sign=jnp.where(state.infeasible, state.sign, sign),
+        y_chosen=jnp.zeros_like(state.y_chosen),
         pending=pending,
     )
 
@@ -243,25 +264,23 @@ class _Step(NamedTuple):
     """Outcome of the ratio test.
 
     Attributes:
-      is_chosen: (M,) 1 at the row to add.
       z: (n,) direction P a of x.
-      r: (M,) direction U a of the multipliers, downwards.
+      r: (n,) direction U a of the slots' multipliers, downwards.
       curvature: a^T P a.
       depends: whether the row's normal depends on the active ones: x does not move.
       t: length of the step; 0 where nothing is done.
-      is_dropped: (M,) 1 at the row that is in the way.
+      dropped: slot of the row that is in the way.
       adds: whether the step ends at the chosen row, not at the one in the way.
       stuck: whether it ends nowhere.
       redundant: whether the row then holds already.
     """
 
-    is_chosen: Array
     z: Array
     r: Array
     curvature: Array
     depends: Array
     t: Array
-    is_dropped: Array
+    dropped: Array
     adds: Array
     stuck: Array
     redundant: Array
@@ -279,6 +298,7 @@ def _advance(
     return chosen._replace(
         chosen=jnp.where(drop, state.chosen, chosen.chosen),
         sign=jnp.where(drop, state.sign, chosen.sign),
+        y_chosen=jnp.where(drop, next_state.y_chosen, 0.0),
         pending=jnp.where(drop, again, chosen.pending),
     )
 
@@ -287,22 +307,20 @@ def _ratio_test(state: ActiveSet, problem: RowProblem, sizes: _Sizes) -> _Step:
     """Step 3."""
     n, dtype = problem.q.shape[0], problem.q.dtype
     eps = float(jnp.finfo(dtype).eps)
-    index = jnp.arange(state.y.shape[0], dtype=jnp.int32)
-    is_chosen = (index == state.chosen).astype(dtype)
-    normal = state.sign * problem.adjoint(is_chosen)
+    normal = state.sign * problem.normal(state.chosen)
     moves = state.stack @ normal
     z, r = moves[:n], moves[n:]
     curvature = z @ normal
-    wanted = is_chosen @ jnp.where(state.sign > 0, problem.low, problem.high)
-    value = is_chosen @ problem.rows(state.x)
-    violation = state.sign * (wanted - value)
+    wanted = jnp.where(state.sign > 0, problem.low[state.chosen], problem.high[state.chosen])
+    violation = state.sign * (wanted - state.value[state.chosen])
     # Rows of equations are never dropped; their normals may push either way.
-    may_drop = (state.bound_status != 0) & ~problem.equal & (r > eps)
+    held = state.slot_row < state.value.shape[0]
+    may_drop = held & ~state.slot_equal & (r > eps)
     ratio = jnp.where(may_drop, state.y / jnp.where(may_drop, r, 1.0), jnp.inf)
     dropped = jnp.argmin(ratio).astype(jnp.int32)
     t_drop = ratio[dropped]
     # A row that depends on the active ones moves nothing: rounding alone is left of its curvature.
-    depends = curvature <= sizes.flat
+    depends = (curvature <= sizes.flat) | held.all()
     t_add = jnp.where(
         depends, jnp.inf, jnp.maximum(violation, 0.0) / jnp.where(depends, 1.0, curvature)
     )
@@ -311,7 +329,6 @@ def _ratio_test(state: ActiveSet, problem: RowProblem, sizes: _Sizes) -> _Step:
     stuck = ~jnp.isfinite(step)
     size = jnp.abs(wanted) + jnp.max(jnp.abs(state.x))
     return _Step(
-        is_chosen=is_chosen,
         z=z,
         r=r,
         curvature=curvature,
@@ -319,36 +336,48 @@ def _ratio_test(state: ActiveSet, problem: RowProblem, sizes: _Sizes) -> _Step:
         redundant=stuck & (violation <= 1e3 * eps * n * size),
         adds=t_add <= t_drop,
         t=jnp.where(state.pending & ~stuck, step, 0.0),
-        is_dropped=(index == dropped).astype(dtype),
+        dropped=dropped,
         stuck=stuck,
     )
 
 
 def _exchange(state: ActiveSet, problem: RowProblem, step: _Step) -> tuple[ActiveSet, Array]:
     """Step 4: the state after the step; and whether a row was dropped."""
-    pending, U = state.pending, state.stack[problem.q.shape[0] :]
-    is_chosen, z, r, curvature, depends, t, is_dropped, adds, stuck, redundant = step
-    x = state.x + jnp.where(depends, 0.0, t) * z
-    y = jnp.maximum(state.y - t * r, jnp.where(problem.equal, -jnp.inf, 0.0)) + t * is_chosen
-    u = is_dropped @ U
+    n, M = problem.q.shape[0], state.value.shape[0]
+    pending, U = state.pending, state.stack[n:]
+    z, r, curvature, depends, t, dropped, adds, stuck, redundant = step
+    add, drop = pending & ~stuck & adds, pending & ~stuck & ~adds
+    slots = jnp.arange(n, dtype=jnp.int32)
+    taken = add & (slots == jnp.argmax(state.slot_row == M))  # the first empty one
+    left = drop & (slots == dropped)
+    dx = jnp.where(depends, 0.0, t) * z
+    y = state.y - t * r
+    y = jnp.where(state.slot_equal, y, jnp.maximum(y, 0.0))
+    y_chosen = state.y_chosen + t
+    y = jnp.where(taken, y_chosen, jnp.where(left, 0.0, y))
+    u = U[dropped]
     Hu = problem.H @ u
     uHu = u @ Hu
     # Added: the new row is active and P loses z. Dropped: P gains u back.
-    add, drop = pending & ~stuck & adds, pending & ~stuck & ~adds
-    by_add = jnp.concatenate([z, r - is_chosen]) / jnp.where(add, curvature, 1.0)
-    by_drop = jnp.concatenate([-u, U @ Hu]) / jnp.where(drop, uHu, 1.0)
+    by_add = jnp.concatenate([z, r - taken]) / jnp.where(add, curvature, 1.0)
+    by_drop = jnp.concatenate([-u, jnp.where(left, uHu, U @ Hu)]) / jnp.where(drop, uHu, 1.0)
     column = jnp.where(add, by_add, jnp.where(drop, by_drop, 0.0))
     stack = state.stack - column[:, None] * jnp.where(add, z, u)[None, :]
-    bound_status = state.bound_status + jnp.where(add, state.sign, 0.0) * is_chosen
-    bound_status = jnp.where(drop, bound_status * (1.0 - is_dropped), bound_status)
-    y = jnp.where(drop, y * (1.0 - is_dropped), y)
+    rows = jnp.arange(M, dtype=jnp.int32)
+    is_chosen = rows == state.chosen
+    is_dropped = drop & (rows == state.slot_row[dropped])
+    becomes_active = (add | (pending & redundant)) & is_chosen
     fails = pending & stuck & ~redundant
     next_state = state._replace(
         stack=stack,
-        x=x,
+        slot_row=jnp.where(taken, state.chosen, jnp.where(left, M, state.slot_row)),
+        slot_equal=jnp.where(taken, problem.equal[state.chosen], state.slot_equal & ~left),
+        x=state.x + dx,
+        value=state.value + problem.rows(dx),
         y=y,
+        y_chosen=y_chosen,
         bound_status=jnp.where(
-            pending & redundant, bound_status + state.sign * is_chosen, bound_status
+            becomes_active, state.sign, jnp.where(is_dropped, 0.0, state.bound_status)
         ),
         infeasible=state.infeasible | fails,
         iterations=state.iterations + pending,
@@ -358,12 +387,13 @@ def _exchange(state: ActiveSet, problem: RowProblem, step: _Step) -> tuple[Activ
 
 def _polish(problem: RowProblem, state: ActiveSet) -> tuple[Float[Array, "n"], Float[Array, "M"]]:
     """Point and multipliers after a Newton step of the equations that the active rows make."""
-    n = problem.q.shape[0]
+    n, M = problem.q.shape[0], state.value.shape[0]
     P, U = state.stack[:n], state.stack[n:]
-    push = problem.adjoint(state.bound_status * state.y)
+    push = problem.adjoint(state.bound_status * state.spread(state.y))
     r_dual = push - problem.H @ state.x - problem.q
     wanted = jnp.where(state.bound_status > 0, problem.low, problem.high)
-    active = (state.bound_status != 0) & (jnp.abs(U).max(axis=1) > 0)
-    r_primal = jnp.where(active, state.bound_status * (wanted - problem.rows(state.x)), 0.0)
+    r_rows = state.bound_status * (wanted - problem.rows(state.x))
+    held = state.slot_row < M
+    r_primal = jnp.where(held, r_rows[jnp.minimum(state.slot_row, M - 1)], 0.0)
     dx = P @ r_dual + U.T @ r_primal
     return state.x + dx, state.y + U @ (problem.H @ dx - r_dual)

@@ -37,6 +37,12 @@ class RowProblem(NamedTuple):
         """Values (m + n,) of rows and box."""
         return jnp.concatenate([self.C @ x, x])
 
+    def normal(self, row: Array) -> Array:
+        """One of the rows, (n,)."""
+        m, n = self.C.shape
+        of_box = (jnp.arange(m, m + n) == row).astype(self.q.dtype)
+        return of_box if m == 0 else jnp.where(row < m, self.C[jnp.minimum(row, m - 1)], of_box)
+
     def adjoint(self, y: Array) -> Array:
         """Transposed rows times multipliers (m + n,)."""
         m = self.C.shape[0]
