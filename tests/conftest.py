@@ -10,10 +10,16 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("NPROC", "1")  # see kjax.cli.configure_jax
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see kjax.threads
 # Compiling is most of the time. LLVM's optimisations cost a third of it, XLA's newer emitter of
-# fused loops more than half of the rest (8.3 s to 3.3 s for ``solve_rows``). A flag that XLA does
-# not know ends the process. Where a test's subject is not the LMPC's rows, its config has the box
-# alone (friction and torque_fraction of inf), which compiles in a third of the time.
-FLAGS = ["--xla_backend_optimization_level=0"]
+# fused loops more than half of the rest (8.3 s to 3.3 s for ``solve_rows``), and reductions split
+# up as trees a quarter of what is left. A flag that XLA does not know ends the process. Where a
+# test's subject is not the LMPC's rows, its config has the box alone (friction and torque_fraction
+# of inf), which compiles in a third of the time.
+FLAGS = [
+    "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes=true",
+    "--xla_disable_hlo_passes=tree_reduction_rewriter",
+    "--xla_cpu_parallel_codegen_split_count=1",  # a worker has one core
+]
 if version("jaxlib") == "0.10.2":  # that of constraints.txt
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
@@ -34,6 +40,8 @@ jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / "
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 jax.block_until_ready(jax.jit(lambda x: x + 1)(0.0))  # XLA has read its flags now
+# Tracing makes millions of objects that stay: looking through them again and again found nothing.
+gc.set_threshold(50_000, 50, 50)
 
 # Shapes and dtypes of annotated arguments are checked in tests only, so before kjax is imported.
 CHECKED = (
