@@ -1,5 +1,6 @@
 """A tilted, turning body on its feet: what the tests of the spatial LMPC share."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -27,38 +28,43 @@ def clock(which, elapsed):
     return Clock(*map(jnp.asarray, (which, 0, 0)), elapsed=jnp.asarray(elapsed))
 
 
-def nodes(which=0, elapsed=0.05, count=12, horizon=0.25):
-    return grid.build_grid(
-        SCHEDULE, clock(which, elapsed), count, node_dt=0.025, horizon=horizon, shortest=0.0025
-    )
+@jax.jit
+def _grid(clock):
+    return grid.build_grid(SCHEDULE, clock, 12, node_dt=0.025, horizon=0.25, shortest=0.0025)
+
+
+@jax.jit
+def _body(turn, omega, v):
+    R = rotations.exp(turn)
+    return BodyState(jnp.array([0.0, 0.0, 0.27]), R, v, srb_spatial.momentum(BODY, R, omega))
+
+
+rollout = jax.jit(srb_spatial.rollout, static_argnames="substeps")
+
+
+def nodes(which=0, elapsed=0.05):
+    return jax.tree.map(np.asarray, _grid(clock(which, elapsed)))
 
 
 def problem(seed=0, which=0):
     """A tilted, turning body, its grid, feet and forces that share the weight."""
     rng = np.random.default_rng(seed)
     found = nodes(which)
-    R = rotations.exp(jnp.asarray(rng.uniform(-0.2, 0.2, 3)))
-    omega = rng.uniform(-1, 1, 3)
-    start = BodyState(
-        jnp.array([0.0, 0.0, 0.27]),
-        R,
-        jnp.asarray(rng.uniform(-0.4, 0.4, 3)),
-        srb_spatial.momentum(BODY, R, jnp.asarray(omega)),
-    )
-    K = len(found.length)
-    feet = jnp.broadcast_to(jnp.asarray(HIPS + rng.uniform(-0.03, 0.03, (4, 3))), (K, 4, 3))
-    count = np.maximum(np.asarray(found.stance).sum(1), 1)[:, None, None]
-    share = np.asarray(found.stance)[..., None] * np.array([0.0, 0.0, WEIGHT]) / count
-    return start, found, feet, jnp.asarray(share)
+    turn, omega, v = (rng.uniform(-most, most, 3) for most in (0.2, 1.0, 0.4))
+    start = jax.tree.map(np.asarray, _body(turn, omega, v))
+    feet = np.tile(HIPS + rng.uniform(-0.03, 0.03, (4, 3)), (len(found.length), 1, 1))
+    count = np.maximum(found.stance.sum(1), 1)[:, None, None]
+    share = found.stance[..., None] * np.array([0.0, 0.0, WEIGHT]) / count
+    return start, found, feet, share
 
 
 def targets(found, force):
     K = len(found.length)
     return momentum.Targets(
-        R=jnp.broadcast_to(jnp.eye(3), (K, 3, 3)),
-        p=jnp.stack([0.3 * found.end, 0.0 * found.end, 0.27 + 0.0 * found.end], axis=-1),
-        omega=jnp.zeros((K, 3)),
-        v=jnp.broadcast_to(jnp.array([0.3, 0.0, 0.0]), (K, 3)),
-        heading=jnp.broadcast_to(jnp.array([0.8, 0.6]), (K, 2)),
+        R=np.tile(np.eye(3), (K, 1, 1)),
+        p=np.stack([0.3 * found.end, 0.0 * found.end, 0.27 + 0.0 * found.end], axis=-1),
+        omega=np.zeros((K, 3)),
+        v=np.tile([0.3, 0.0, 0.0], (K, 1)),
+        heading=np.tile([0.8, 0.6], (K, 1)),
         force=force,
     )
