@@ -19,8 +19,7 @@ from kjax.dynamics import srb_planar
 from kjax.koopman import models, observables
 from kjax.legs.kinematics import LegTrig, leg_trig
 from kjax.legs.posture import stand_pose
-from kjax.mpc import lmpc
-from kjax.mpc.limits import force_limits
+from kjax.mpc import limits, lmpc
 from kjax.qp import Status
 from kjax.robots import go1
 from kjax.spec import ControllerSpec
@@ -62,12 +61,22 @@ lift = jax.jit(observables.paper(4).lift)
 reference_trajectory = jax.jit(planning.reference_trajectory)
 condense_all = jax.jit(lmpc.build_tables, static_argnames=("steps", "horizon"))
 solve = jax.jit(lmpc.solve_lmpc, static_argnames="spec")
+shift_plan = jax.jit(lmpc.shift_plan, static_argnums=1)
+start_memory = jax.jit(lmpc.start_memory, static_argnums=1)
+input_map = jax.jit(models.input_map)
+
+
+@partial(jax.jit, static_argnames=("friction", "torque_fraction"))
+def force_limits(trig, rotation, stance, friction, torque_fraction):
+    return limits.force_limits(
+        go1.PARAMS, trig, rotation, stance, friction=friction, torque_fraction=torque_fraction
+    )
 
 
 def here(tables, mode, feet):
     """The tables' model of a mode for contact points that are measured."""
-    model = jax.tree.map(lambda a: a[mode], tables.model)
-    return model._replace(B=models.input_map(model, feet))
+    model = jax.tree.map(lambda a: np.asarray(a)[mode], tables.model)
+    return model._replace(B=input_map(model, feet))
 
 
 def mode_settings(lmpc, bound, force):
@@ -87,7 +96,7 @@ def build(model, feet, config, bound):
         mode_settings(config, bound, jnp.asarray(wanted)),
         steps=round(config.model_dt / DT),
         horizon=config.horizon,
-        feet=jnp.tile(feet, (len(Mode), 1, 1)),
+        feet=np.tile(feet, (len(Mode), 1, 1)),
     )
 
 
@@ -116,25 +125,25 @@ def bounded(model, body):
 @pytest.fixture(scope="module")
 def start():
     """A disturbed state (6,) and a reference (4, 6) of walking at 0.3 m/s."""
-    x = jnp.array([0.02, 0.25, 0.05, 0.1, -0.1, 0.4])
+    x = np.array([0.02, 0.25, 0.05, 0.1, -0.1, 0.4])
     reference = reference_trajectory(
-        position=jnp.asarray(0.0),
-        height=jnp.asarray(0.27),
-        velocity=jnp.asarray(0.3),
-        periodic=jnp.zeros((4, 4)),
-        ahead=jnp.asarray(AHEAD),
+        position=np.asarray(0.0),
+        height=np.asarray(0.27),
+        velocity=np.asarray(0.3),
+        periodic=np.zeros((4, 4)),
+        ahead=AHEAD,
     )
-    return x, reference
+    return x, np.asarray(reference)
 
 
 def memory(dtype="float64"):
     """Nothing remembered."""
-    return lmpc.LmpcMemory(plan=jnp.zeros(16, dtype), problem=jnp.asarray(-1, jnp.int32), warm=None)
+    return lmpc.LmpcMemory(plan=np.zeros(16, dtype), problem=np.asarray(-1, np.int32), warm=None)
 
 
 def horizon_by_hand(model, mode, config, x):
     """Free response and forced response of the states over the horizon, by stepping in numpy."""
-    A, B = np.asarray(model.A[mode]), np.asarray(model.B[mode])
+    A, B = np.asarray(model.A)[mode], np.asarray(model.B)[mode]
     k, hold = config.horizon, round(config.model_dt / DT)
 
     def run(z, plan):
@@ -157,7 +166,7 @@ def test_without_active_bounds_the_plan_is_the_least_squares_regulator(mode, fre
     Each mode with its own weights, and with the forces of its stance legs only.
     """
     x, reference = start
-    plan = solve(free, jnp.asarray(int(mode)), lift(x), reference, memory(), spec=FREE_SPEC)
+    plan = solve(free, np.asarray(int(mode)), lift(x), reference, memory(), spec=FREE_SPEC)
     assert plan.status == Status.SOLVED
     response, forced = horizon_by_hand(model, mode, FREE, x)
     own = FREE_BOUND if mode in (Mode.FRONT, Mode.REAR) else FREE
@@ -185,9 +194,9 @@ def test_plans_respect_the_bounds_and_swing_legs_get_exactly_no_force(mode, name
     limits = np.array([own.grf_x_max, own.grf_z_min, own.grf_z_max]) * WEIGHT
     limits = limits.astype(name)
     for scale in (1.0, 30.0):  # the larger disturbance drives every force to a bound
-        x, reference = (jnp.asarray(a, name) for a in start)
+        x, reference = (a.astype(name) for a in start)
         z = lift(scale * (x - reference[0]) + reference[0])
-        solution = solve(tables, jnp.asarray(int(mode)), z, reference, memory(name), spec)
+        solution = solve(tables, np.asarray(int(mode)), z, reference, memory(name), spec)
         assert solution.status == Status.SOLVED
         forces = np.asarray(solution.plan).reshape(4, 2, 2)
         for end, standing in enumerate(MODE_ALPHA[mode] > 0):
@@ -210,9 +219,9 @@ def test_tables_hold_the_model_over_one_model_step(bounded, model):
 
 def test_contact_points_make_no_difference_to_a_model_that_ignores_them(bounded, start):
     x, reference = start
-    arguments = (bounded, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
+    arguments = (bounded, np.asarray(int(Mode.TROT)), lift(x), reference, memory())
     offline = solve(*arguments, spec=SPEC)
-    model = here(bounded, Mode.TROT, jnp.array([[0.1, -0.2], [-0.3, -0.4]]))
+    model = here(bounded, Mode.TROT, np.array([[0.1, -0.2], [-0.3, -0.4]]))
     online = solve(*arguments, spec=SPEC, model=model)
     assert offline.status == online.status == Status.SOLVED
     # The same iterations but for rounding: 2e-16 times condition 1e5 times forces of 1e2 N.
@@ -229,7 +238,7 @@ def test_measured_contact_points_at_their_nominal_place_give_the_tables_plan(
     mode, measured, body, start
 ):
     x, reference = start
-    arguments = (measured, jnp.asarray(int(mode)), lift(x), reference, memory())
+    arguments = (measured, np.asarray(int(mode)), lift(x), reference, memory())
     offline = solve(*arguments, spec=SPEC)
     online = solve(*arguments, spec=SPEC, model=here(measured, mode, body.feet))
     assert offline.status == online.status == Status.SOLVED
@@ -239,14 +248,15 @@ def test_measured_contact_points_at_their_nominal_place_give_the_tables_plan(
 
 def test_a_foot_further_forward_takes_less_of_the_weight_to_hold_the_pitch(measured, body):
     """Statics: level and at rest, the two vertical forces balance their moments about the CoM."""
-    x = jnp.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0])
-    reference = jnp.tile(x, (4, 1))
+    x = np.array([0.0, 0.27, 0.0, 0.0, 0.0, 0.0])
+    reference = np.tile(x, (4, 1))
     shares = []
     for shift in (-0.05, 0.0, 0.05):
-        feet = body.feet.at[0, 0].add(shift)
-        arguments = (measured, jnp.asarray(int(Mode.TROT)), lift(x), reference, memory())
+        feet = np.array(body.feet)
+        feet[0, 0] += shift
+        arguments = (measured, np.asarray(int(Mode.TROT)), lift(x), reference, memory())
         model = here(measured, Mode.TROT, feet)
-        force = solve(*arguments, spec=SPEC, model=model).plan[:4]
+        force = np.asarray(solve(*arguments, spec=SPEC, model=model).plan)
         shares.append(float(force[1] / (force[1] + force[3])))
     assert shares[0] > shares[1] > shares[2]
 
@@ -255,28 +265,31 @@ def test_plans_of_a_batch_with_mixed_modes_equal_single_plans(bounded, start):
     x, reference = start
     batch = jax.jit(
         jax.vmap(
-            lambda mode, z: lmpc.solve_lmpc(bounded, mode, z, reference, memory(), SPEC),
+            lambda mode, z: lmpc.solve_lmpc(
+                bounded, mode, z, jnp.asarray(reference), jax.tree.map(jnp.asarray, memory()), SPEC
+            ),
             in_axes=(0, 0),
         )
     )
-    states = jnp.stack([x + 0.01 * i for i in range(len(Mode))])
-    plans = batch(jnp.arange(len(Mode)), jax.vmap(lift)(states))
+    states = np.stack([x + 0.01 * i for i in range(len(Mode))])
+    lifted = np.stack([lift(x) for x in states])
+    plans = jax.tree.map(np.asarray, batch(np.arange(len(Mode)), lifted))
     for mode in Mode:
-        single = solve(
-            bounded, jnp.asarray(int(mode)), lift(states[mode]), reference, memory(), SPEC
-        )
+        single = solve(bounded, np.asarray(int(mode)), lifted[mode], reference, memory(), SPEC)
         assert plans.status[mode] == single.status == Status.SOLVED
         # As above: rounding seen through the condition.
         np.testing.assert_allclose(plans.plan[mode], single.plan, rtol=0, atol=1e-8)
 
 
 def test_changing_mode_and_state_traces_once(bounded, start):
+    reference, nothing = jax.device_put((start[1], memory()))
+
     @jax.jit
     @chex.assert_max_traces(n=1)
     def plan(mode, x):
-        return lmpc.solve_lmpc(bounded, mode, lift(x), start[1], memory(), SPEC)
+        return lmpc.solve_lmpc(bounded, mode, lift(x), reference, nothing, SPEC)
 
-    results = [plan(jnp.asarray(int(mode)), start[0]) for mode in Mode]
+    results = [plan(np.asarray(int(mode)), start[0]) for mode in Mode]
     chex.assert_trees_all_equal_shapes_and_dtypes(*results)
 
 
@@ -296,8 +309,9 @@ def test_the_rigid_body_under_the_plan_stands_up_from_a_tilt(bounded, body):
 
     x0 = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
     _, (states, status) = jax.jit(lambda carry: jax.lax.scan(tick, carry, length=200))(
-        (x0, lmpc.start_memory(bounded, SPEC))
+        (x0, start_memory(bounded, SPEC))
     )
+    states = np.asarray(states)
     np.testing.assert_array_equal(status, Status.SOLVED)
     # 0.1 rad shrinks fivefold; the input weight on the absolute force leaves a droop in height.
     assert abs(states[-1, 2]) < 0.02
@@ -339,14 +353,18 @@ def test_the_contact_points_of_each_mode_enter_its_own_tables(fitted_moving_feet
     model = fitted_moving_feet[0]
     settings = mode_settings(BOUNDED, BOUND, jnp.zeros((len(Mode), 2)))
     arguments = {"steps": 5, "horizon": 4}
-    same = jnp.tile(body.feet, (len(Mode), 1, 1))
-    shifted = same.at[Mode.FRONT, 0, 0].add(0.05)
-    one, other = (condense_all(model, settings, **arguments, feet=feet) for feet in (same, shifted))
+    same = np.tile(body.feet, (len(Mode), 1, 1))
+    shifted = same.copy()
+    shifted[Mode.FRONT, 0, 0] += 0.05
+    one, other = (
+        np.asarray(condense_all(model, settings, **arguments, feet=feet).F)
+        for feet in (same, shifted)
+    )
     for mode in Mode:
-        change = np.abs(np.asarray(other.F[mode] - one.F[mode])).max()
+        change = np.abs(other[mode] - one[mode]).max()
         if mode == Mode.FRONT:
             # 5 cm more of lever arm, of about 20: a good part of the pitch terms.
-            assert change > 0.02 * np.abs(one.F[mode][:, 3]).max()
+            assert change > 0.02 * np.abs(one[mode][:, 3]).max()
         else:
             assert change == 0.0, mode
 
@@ -385,28 +403,26 @@ def test_the_reference_rides_on_the_periodic_motion(dtype):
 )
 def test_shifting_a_plan_drops_what_has_passed_and_repeats_its_end(control_dt, order):
     spec = ControllerSpec(horizon=4, model_dt=0.005, control_dt=control_dt)
-    plan = jnp.arange(16.0)
-    shifted = np.asarray(lmpc.shift_plan(plan, spec)).reshape(4, 4)
+    shifted = np.asarray(shift_plan(np.arange(16.0), spec)).reshape(4, 4)
     np.testing.assert_array_equal(shifted, np.arange(16.0).reshape(4, 4)[order])
 
 
 def test_shifting_a_plan_of_one_step_keeps_it():
-    plan = jnp.arange(4.0)
-    np.testing.assert_array_equal(lmpc.shift_plan(plan, ControllerSpec(horizon=1)), plan)
+    plan = np.arange(4.0)
+    np.testing.assert_array_equal(shift_plan(plan, ControllerSpec(horizon=1)), plan)
 
 
 def test_a_tableau_carried_across_modes_changes_no_plan(bounded, start):
     """Trot, front, front, trot, rear: the memory of another mode is another Hessian's."""
     x, reference = start
-    carried = lmpc.start_memory(bounded, SPEC)
-    plan = jax.jit(
-        lambda mode, x, carried: lmpc.solve_lmpc(bounded, mode, lift(x), reference, carried, SPEC)
-    )
+    carried = start_memory(bounded, SPEC)
     for i, mode in enumerate((Mode.TROT, Mode.FRONT, Mode.FRONT, Mode.TROT, Mode.REAR)):
-        now = jnp.asarray(int(mode), jnp.int32)
-        seen = x.at[2].add(0.02 * i)
-        warm = plan(now, seen, carried)
-        cold = solve(bounded, now, lift(seen), reference, memory(), spec=SPEC)
+        now = np.asarray(int(mode), np.int32)
+        seen = x.copy()
+        seen[2] += 0.02 * i
+        z = lift(seen)
+        warm = solve(bounded, now, z, reference, carried, spec=SPEC)
+        cold = solve(bounded, now, z, reference, memory(), spec=SPEC)
         assert warm.status == Status.SOLVED
         np.testing.assert_allclose(warm.plan, cold.plan, rtol=0, atol=1e-8)
         carried = lmpc.LmpcMemory(plan=warm.plan, problem=now, warm=warm.warm)
@@ -414,19 +430,18 @@ def test_a_tableau_carried_across_modes_changes_no_plan(bounded, start):
 
 def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bounded, start):
     x, reference = start
-    mode = jnp.asarray(int(Mode.TROT), jnp.int32)
-    posture = LegTrig(*(jnp.full((4,), f(a)) for a in (0.9, -0.9) for f in (np.sin, np.cos)))
-    stance = jnp.array([True, False, False, True])
+    mode = np.asarray(int(Mode.TROT), np.int32)
+    posture = LegTrig(*(np.full((4,), f(a)) for a in (0.9, -0.9) for f in (np.sin, np.cos)))
+    stance = np.array([True, False, False, True])
 
     def planned(friction, fraction):
-        rows = force_limits(
-            go1.PARAMS, posture, jnp.eye(2), stance, friction=friction, torque_fraction=fraction
-        )
+        rows = force_limits(posture, np.eye(2), stance, friction, fraction)
         solution = solve(bounded, mode, lift(x), reference, memory(), spec=SPEC, rows=rows)
         assert solution.status == Status.SOLVED
         return np.asarray(solution.plan).reshape(4, 4), rows
 
-    box = solve(bounded, mode, lift(x), reference, memory(), spec=SPEC).plan.reshape(4, 4)
+    box = solve(bounded, mode, lift(x), reference, memory(), spec=SPEC).plan
+    box = np.asarray(box).reshape(4, 4)
     wide, _ = planned(1e3, 1e3)
     np.testing.assert_allclose(wide, box, rtol=0, atol=1e-6)
     ratio = np.abs(box[:, ::2]) / np.maximum(box[:, 1::2], 1e-9)
@@ -435,9 +450,8 @@ def test_rows_hold_friction_and_torque_and_give_way_where_they_do_not_bind(bound
     assert (np.abs(tight[:, ::2]) <= mu * tight[:, 1::2] + 1e-6).all()
     torque = np.abs(np.einsum("rf,kf->kr", planned(None, 1.0)[1].A, box))
     fraction = 0.8 * float((torque / np.tile(go1.PARAMS.torque_limit[1:], 2)).max())
-    _, rows = planned(None, fraction)
-    limited, _ = planned(None, fraction)
-    assert (np.abs(np.asarray(limited @ rows.A.T)) <= np.asarray(rows.high) + 1e-6).all()
+    limited, rows = planned(None, fraction)
+    assert (np.abs(limited @ np.asarray(rows.A).T) <= np.asarray(rows.high) + 1e-6).all()
 
 
 def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():
@@ -445,10 +459,8 @@ def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():
     pitch, mu = 0.4, 0.6
     c, s = np.cos(pitch), np.sin(pitch)
     R = np.array([[c, -s], [s, c]])  # nose up: body to world
-    posture = leg_trig(jnp.asarray(stand_pose(go1.PARAMS, 0.27)[1]))
-    rows = force_limits(
-        go1.PARAMS, posture, jnp.asarray(R), jnp.ones(4, bool), friction=mu, torque_fraction=None
-    )
+    posture = jax.jit(leg_trig)(stand_pose(go1.PARAMS, 0.27)[1])
+    rows = jax.tree.map(np.asarray, force_limits(posture, R, np.ones(4, bool), mu, None))
     for world in ([0.0, 100.0], [59.9, 100.0], [-59.9, 100.0]):
         u = np.tile(R.T @ world, 2)
         assert (rows.A @ u <= rows.high + 1e-9).all()
@@ -460,14 +472,12 @@ def test_friction_rows_are_the_grounds_whatever_the_trunks_pitch():
 
 def test_with_rows_the_warm_start_is_carried_and_admm_plans_the_same(bounded, start):
     x, reference = start
-    mode = jnp.asarray(int(Mode.TROT), jnp.int32)
-    posture = LegTrig(*(jnp.full((4,), f(a)) for a in (0.9, -0.9) for f in (np.sin, np.cos)))
-    stance = jnp.array([True, False, False, True])
-    rows = force_limits(
-        go1.PARAMS, posture, jnp.eye(2), stance, friction=0.05, torque_fraction=0.95
-    )
+    mode = np.asarray(int(Mode.TROT), np.int32)
+    posture = LegTrig(*(np.full((4,), f(a)) for a in (0.9, -0.9) for f in (np.sin, np.cos)))
+    stance = np.array([True, False, False, True])
+    rows = force_limits(posture, np.eye(2), stance, 0.05, 0.95)
     z = lift(x)
-    carried = lmpc.start_memory(bounded, SPEC)
+    carried = start_memory(bounded, SPEC)
     first = solve(bounded, mode, z, reference, carried, spec=SPEC, rows=rows)
     assert first.warm is not None
     again = lmpc.LmpcMemory(plan=first.plan, problem=mode, warm=first.warm)

@@ -16,6 +16,12 @@ from kjax.prediction import evaluation, families, features
 from kjax.types import GRAVITY, MODE_ALPHA, Mode
 
 DT = 1e-3
+# Outside jit each operation is a program of its own.
+rollout = jax.jit(families.rollout, static_argnums=0)
+operating_point = jax.jit(families.operating_point, static_argnums=0, static_argnames="steps")
+trajectory = jax.jit(srb_planar.trajectory, static_argnums=(0, 5))
+linearised_srb = jax.jit(families.linearised_srb, static_argnums=(2, 3))
+EXACT, LONG_EXACT = families.exact(DT), families.exact(100 * DT)
 X0 = np.array([0.3, 0.27, 0.2, 0.4, -0.1, 0.8])
 
 
@@ -62,26 +68,25 @@ def integrated(params, feet, inputs, world):
 def test_planted_bodies_move_as_an_adaptive_integrator_says(params, start, plant):
     inputs = forces(20)
     wanted = integrated(params, start.feet, inputs, world=plant == "space")
-    run = jax.jit(srb_planar.trajectory, static_argnums=(0, 5))
-    got = run(plant, params.body, params.alpha, start.x, jnp.asarray(inputs), DT)
+    got = trajectory(plant, params.body, params.alpha, start.x, inputs, DT)
     # Runge-Kutta at 1 ms: dt^5 / 120 times fifth derivatives of up to 1e5 (a force on one end turns
     # the body at 100 rad/s^2) over 20 steps; the reference is good to 1e-12.
     np.testing.assert_allclose(got, wanted, rtol=0, atol=2e-9)
 
 
 def test_the_exact_model_is_exact(params, start):
-    inputs = jnp.asarray(forces(500))
-    wanted = srb_planar.trajectory("space", params.body, params.alpha, start.x, inputs, DT)
-    got = families.rollout(families.exact(DT), params, start, inputs)
+    inputs = forces(500)
+    wanted = trajectory("space", params.body, params.alpha, start.x, inputs, DT)
+    got = rollout(EXACT, params, start, inputs)
     # Runge-Kutta integrates these polynomials exactly: rounding over 500 steps is left.
     np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11)
 
 
 def test_one_exact_step_of_100_ms_equals_100_of_one(params, start):
-    u = jnp.asarray(forces(1)[0])
-    long = families.rollout(families.exact(100 * DT), params, start, u[None])[-1]
-    short = families.rollout(families.exact(DT), params, start, jnp.tile(u, (100, 1)))[-1]
-    np.testing.assert_allclose(long, short, rtol=0, atol=1e-12)
+    u = forces(1)
+    long = rollout(LONG_EXACT, params, start, u)
+    short = rollout(EXACT, params, start, np.tile(u, (100, 1)))
+    np.testing.assert_allclose(np.asarray(long)[-1], np.asarray(short)[-1], rtol=0, atol=1e-12)
 
 
 def test_edmd_finds_the_exact_model_by_itself(body):
@@ -128,7 +133,8 @@ def every_family(body):
     draw = jax.jit(lambda key: sample(key, body, alpha, ranges, rollouts=60, steps=20, dt=DT))
     data = draw(jax.random.key(0))
     dictionary = observables.paper(2, constant_rotation=True)
-    weights = jnp.zeros((6, 17)).at[3, 5].set(1e-5)
+    weights = np.zeros((6, 17))
+    weights[3, 5] = 1e-5
     one, two = jax.jit(
         lambda data: [
             fit(dictionary, data, feet_terms=True)[0] for fit in (edmd.fit, edmd.fit_bilinear)
@@ -139,7 +145,7 @@ def every_family(body):
         "bilinear": (families.bilinear(dictionary, DT), two),
         "srb_hover": (
             families.linear(observables.states_only(), DT, "srb_hover"),
-            jax.jit(lambda: families.linearised_srb(body, alpha, 0.27, DT))(),
+            linearised_srb(body, alpha, 0.27, DT),
         ),
         "srb": (families.rigid_body(DT), known),
         "planted": (families.planted(DT), known),
@@ -157,7 +163,7 @@ NAMES = ("linear", "bilinear", "srb_hover", "srb", "planted", "exact", "residual
 @pytest.mark.parametrize("name", NAMES)
 def test_a_lifted_state_begins_with_one_and_the_state(every_family, start, name):
     family, params = every_family[name]
-    z = family.lift(params, start)
+    z = jax.jit(family.lift)(params, start)
     assert z.shape == (family.size,)
     np.testing.assert_array_equal(z[:7], np.r_[1.0, X0])
     assert family.name == name
@@ -166,10 +172,14 @@ def test_a_lifted_state_begins_with_one_and_the_state(every_family, start, name)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_operating_point_is_the_tangent(every_family, start, name):
     family, params = every_family[name]
-    u = jnp.asarray(forces(1)[0])
-    z = family.lift(params, start)
-    step = jax.jit(lambda z, u: family.step(params, start, z, u))
-    here = jax.jit(lambda u: families.operating_point(family, params, start, u))(u)
+    u = forces(1)[0]
+    z = np.asarray(jax.jit(family.lift)(params, start))
+    run = jax.jit(family.step)
+
+    def step(z, u):
+        return np.asarray(run(params, start, z, u))
+
+    here = jax.tree.map(np.asarray, operating_point(family, params, start, u))
     np.testing.assert_allclose(here.A @ z + here.B @ u, step(z, u), rtol=0, atol=1e-13)
     rng = np.random.default_rng(1)
     dz, du = rng.normal(size=z.shape), rng.normal(size=4)
@@ -183,10 +193,12 @@ def test_the_operating_point_is_the_tangent(every_family, start, name):
 @pytest.mark.parametrize("name", NAMES)
 def test_many_steps_at_once_are_the_steps_one_after_another(every_family, start, name):
     family, params = every_family[name]
-    u = jnp.asarray(forces(1)[0])
-    one = families.operating_point(family, params, start, u)
-    five = families.operating_point(family, params, start, u, steps=5)
-    z = family.lift(params, start)
+    u = forces(1)[0]
+    one, five = (
+        jax.tree.map(np.asarray, operating_point(family, params, start, u, **more))
+        for more in ({}, {"steps": 5})
+    )
+    z = np.asarray(jax.jit(family.lift)(params, start))
     wanted = z
     for _ in range(5):
         wanted = one.A @ wanted + one.B @ u
@@ -195,24 +207,26 @@ def test_many_steps_at_once_are_the_steps_one_after_another(every_family, start,
 
 def test_the_hovering_model_holds_the_lever_arms(body):
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
-    model = families.linearised_srb(body, alpha, 0.27, DT)
-    feet = jnp.array([[0.25, -0.3], [-0.1, -0.2]])
-    B = np.asarray(input_map(model, feet))
+    model = linearised_srb(body, alpha, 0.27, DT)
+    feet = np.array([[0.25, -0.3], [-0.1, -0.2]])
+    B = np.asarray(jax.jit(input_map)(model, feet))
     arms = np.array([0.3, 0.25, 0.2, -0.1]) * np.repeat(MODE_ALPHA[Mode.TROT], 2)
     np.testing.assert_allclose(B[6], DT * arms / body.inertia, rtol=0, atol=1e-15)
     # Pitching nose up turns the lift backwards: d v_x / d theta = -g dt when hovering.
-    np.testing.assert_allclose(model.A[4, 3], -GRAVITY * DT, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(model.A)[4, 3], -GRAVITY * DT, rtol=1e-6)
 
 
 def test_a_residual_adds_what_its_weights_say(body, start):
     alpha = jnp.asarray(MODE_ALPHA[Mode.TROT], float)
     known = families.BodyModel(body, alpha)
     family = families.residual(DT, features.affine, remembers=False)
-    u = jnp.asarray(forces(1)[0])
-    z = family.lift(None, start)
-    plain = families.planted(DT).step(known, start, z, u)
-    W = jnp.zeros((6, 17)).at[5, 0].set(0.01).at[3, 5].set(-1e-4)
-    got = family.step(families.ResidualModel(known, W), start, z, u) - plain
+    u = forces(1)[0]
+    z = jax.jit(lambda start: family.lift(None, start))(start)
+    plain = jax.jit(families.planted(DT).step)(known, start, z, u)
+    W = np.zeros((6, 17))
+    W[5, 0], W[3, 5] = 0.01, -1e-4
+    got = jax.jit(family.step)(families.ResidualModel(known, W), start, z, u)
+    got = np.asarray(got) - np.asarray(plain)
     wanted = np.zeros(7)
     wanted[6], wanted[4] = 0.01, -1e-4 * float(u[0])
     np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-16)
@@ -239,12 +253,15 @@ def test_bootstrap_needs_episodes():
 def test_the_response_to_forces_of_the_linearised_body_is_its_own(body):
     """0.1 s ahead; and a wrong entry of B is reported as what it is."""
     alpha = MODE_ALPHA[Mode.TROT]
-    model = families.linearised_srb(body, jnp.asarray(alpha, float), 0.27, DT)
+    model = linearised_srb(body, jnp.asarray(alpha, float), 0.27, DT)
     judge = partial(
         evaluation.force_response_error, body=body, alpha=alpha, steps=100, duration=0.1
     )
     assert judge(model) < 0.02  # the step of 1 ms against the closed form
-    wrong = model._replace(B=model.B.at[4, 0].add(0.5 * DT / body.mass))
-    pushed = 0.1 / body.mass
-    own = pushed + GRAVITY * body.feet[:, 1] / body.inertia * 0.1**3 / 6  # tilting under gravity
+    B = np.array(model.B)
+    B[4, 0] += 0.5 * DT / float(body.mass)
+    wrong = model._replace(B=B)
+    pushed = 0.1 / float(body.mass)
+    lever = np.asarray(body.feet)[:, 1] / float(body.inertia)
+    own = pushed + GRAVITY * lever * 0.1**3 / 6  # tilting under gravity
     np.testing.assert_allclose(judge(wrong), 0.5 * pushed / own.max(), rtol=0.03)

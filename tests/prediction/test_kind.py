@@ -2,6 +2,7 @@
 
 import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -59,7 +60,8 @@ def test_a_kind_of_ones_own_plans_as_one_of_kjax(monkeypatch):
         spec, params = resolve(config)
         controller, tables = build_controller(spec), condense(spec, params)
         seen = standing(jnp.asarray(stand_pose(go1.PARAMS, 0.265)[1]))
-        state, info = controller.plan(tables, controller.init(tables, seen), seen)
+        start = jax.jit(controller.init)(tables, seen)
+        state, info = jax.jit(controller.plan)(tables, start, seen)
         assert int(info.status) == 0
         plans.append(np.asarray(state.force))
     assert np.abs(plans[0]).max() > 30.0
