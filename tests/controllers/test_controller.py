@@ -90,7 +90,7 @@ def act(controller):
 
 def after_first_plan(controller, tables, plan, observation=None):
     observation = standing() if observation is None else observation
-    return plan(tables, controller.init(tables, observation), observation)
+    return plan(tables, jax.jit(controller.init)(tables, observation), observation)
 
 
 def test_the_first_plan_enters_the_first_phase_with_one_diagonal_on_the_ground(
@@ -564,19 +564,16 @@ def test_a_non_finite_observation_is_reported_and_spreads_nowhere(
 def test_a_batch_of_robots_equals_single_ones(controller, tables, plan):
     shifts = jnp.linspace(-0.01, 0.01, 5)
     batch = jax.vmap(lambda dz: standing(base_pos=jnp.array([0.0, 0.0, 0.285]) + dz))(shifts)
-    states = jax.vmap(controller.init, in_axes=(None, 0))(tables, batch)
+    states = jax.jit(jax.vmap(controller.init, in_axes=(None, 0)))(tables, batch)
     together, _ = jax.jit(jax.vmap(controller.plan, in_axes=(None, 0, 0)))(tables, states, batch)
+    states, batch = jax.tree.map(np.asarray, (states, batch))
     for i in range(5):
-        alone, _ = plan(
-            tables,
-            jax.tree.map(lambda a, i=i: a[i], states),
-            jax.tree.map(lambda a, i=i: a[i], batch),
-        )
+        alone, _ = plan(tables, *jax.tree.map(lambda a, i=i: a[i], (states, batch)))
         # 1e-9 N: the same operations, summed in another order
         np.testing.assert_allclose(together.force[i], alone.force, atol=1e-9)
 
 
-def test_measured_feet_and_fixed_feet_agree_where_the_feet_are_nominal(controller):
+def test_measured_feet_and_fixed_feet_agree_where_the_feet_are_nominal(controller, tables, plan):
     """With the robot standing, the measured contact points differ from the fixed ones by mm."""
     config = load_config(RunConfig, None, {"sim.base": "planar", "koopman.feet": "measured"})
     measured = build_controller(controller_spec(config))
@@ -584,9 +581,7 @@ def test_measured_feet_and_fixed_feet_agree_where_the_feet_are_nominal(controlle
     ours, info = jax.jit(measured.step)(
         *_start(measured, condense(*resolve(config, go1.PARAMS)), low)
     )[::2]
-    theirs = jax.jit(controller.step)(
-        *_start(controller, condense(*resolve(CONFIG, go1.PARAMS)), low)
-    )[0]
+    theirs, _ = after_first_plan(controller, tables, plan, low)
     assert int(info.status) == qp.Status.SOLVED
     # 1.5 N of 60: B is fitted on other data, and the contact points are a few mm apart
     np.testing.assert_allclose(ours.force, theirs.force, atol=1.5)
@@ -625,7 +620,7 @@ def test_a_residual_model_knows_the_last_force_and_the_place_in_the_stance(tmp_p
         assert info.status == qp.Status.SOLVED
     last = before[-1]
     stance_time = 0.5 * config.gaits.trot.period
-    view = build_base(config.sim.base).view(tables.params.robot, None, observation)
+    view = jax.jit(build_base(config.sim.base).view)(tables.params.robot, None, observation)
     feet = np.array(view.planar.feet - view.planar.x[:2]).reshape(2, 2, 2)
     feet[..., 1] -= go1.FOOT_RADIUS
     contacts = np.stack([feet[i][np.asarray(state.stance).reshape(2, 2)[i]][0] for i in range(2)])

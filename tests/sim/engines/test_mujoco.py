@@ -34,6 +34,7 @@ SHORT = {
     "command.v_x": [0.0, 0.2],
     "lmpc.command_slew": np.inf,
 }
+BOX = {"lmpc.friction": np.inf, "lmpc.torque_fraction": np.inf}
 
 
 @pytest.fixture(scope="module")
@@ -263,15 +264,22 @@ def test_front_feet_of_a_bound_touch_down_together_and_apart_from_the_rear_ones(
     assert loaded[late, 2:].any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_trot_to_bound_and_back_in_place(seed):
+@pytest.fixture(scope="module")
+def switching():
     """Bound asked for at 1 s, trot again at 2 s; with the prediction over 0.2 s."""
     chosen = IN_PLACE | {"duration": 6.0, "lmpc.model_dt": 0.02, "lmpc.horizon": 10}
     chosen |= {"lmpc.Q": [3.63, 18.15, 50.0, 25.07, 4.179, 3.454]}
     chosen |= {"gait.names": ["trot", "bound", "trot"], "gait.times": [0.0, 1.0, 2.0]}
-    episode = resolve_episode(load_config(RunConfig, None, chosen), seed=seed)
-    run = simulate(MujocoEngine(episode.spec), episode)
+    config = load_config(RunConfig, None, chosen)
+    return MujocoEngine(batch_spec(config)), config
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_trot_to_bound_and_back_in_place(switching, seed):
+    engine, config = switching
+    episode = resolve_episode(config, seed=seed)
+    run = simulate(engine, episode)
     result = metrics(run, episode.goal)
     assert not result["fell"]
     assert result["qp_unsolved"] == 0
@@ -338,7 +346,7 @@ def test_the_single_engine_walks_several_configs_and_records_every_step(simulati
 
 
 def test_torques_may_be_held_on_the_single_engine_too():
-    config = load_config(RunConfig, None, SHORT | {"duration": 0.3})
+    config = load_config(RunConfig, None, SHORT | BOX | {"duration": 0.3})
     single = simulate(
         MujocoEngine(batch_spec(config), torques="held", dtype=np.float64), resolve_episode(config)
     )
