@@ -1,5 +1,7 @@
 """(1, p, v, H) closes exactly, and EDMD finds the model from 400 samples in every contact mode."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,57 +20,60 @@ MODES = {"trot": (0, 3), "front": (0, 1), "rear": (2, 3), "stand": (0, 1, 2, 3),
 DT, STEPS = 0.025, 8
 
 
+exp = jax.jit(rotations.exp)
+fit = jax.jit(momentum.fit)
+exact_model = jax.jit(momentum.exact_model, static_argnums=3)
+rollout = jax.jit(jax.vmap(momentum.rollout, (None, 0, 0)))
+angular_momentum = jax.jit(jax.vmap(momentum.angular_momentum, (None, 0, None)))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(0, 0, None, None))
+def walked(state, force, feet, about):
+    """Lifted states and angular momenta along the nonlinear motion."""
+    contacts = Contacts(jnp.broadcast_to(feet, force.shape), force)
+    length = jnp.full(force.shape[0], DT)
+    states = srb_spatial.rollout(BODY, state, contacts, length, substeps=4)
+    return jax.vmap(lambda s: momentum.lift(BODY, s, about))(states), states.L
+
+
 def sample(seed, legs, count, steps, about):
     """Lifted trajectories (count, steps + 1, 10), inputs (count, steps, 3n), of the rigid body."""
     rng = np.random.default_rng(seed)
     feet = HIPS[list(legs)] + about * [1, 1, 0]
     w = rng.uniform(-1, 1, (count, 3)) * [0.3, 0.3, 3.0]  # any heading
-    R = np.asarray(rotations.exp(jnp.asarray(w)))
+    R = np.asarray(exp(w))
     p = about + rng.uniform(-0.1, 0.1, (count, 3)) + [0, 0, 0.27]
     v = rng.uniform(-1, 1, (count, 3)) * [1.0, 0.4, 0.3]
     L = np.einsum("nij,jk,nlk,nl->ni", R, np.array(INERTIA), R, rng.uniform(-3, 3, (count, 3)))
     load = 12.743 * 9.81 / len(legs) * rng.uniform(0.3, 1.7, (count, steps, len(legs)))
     force = np.stack([*(0.4 * load * rng.uniform(-1, 1, (2, *load.shape))), load], axis=-1)
-
-    def one(state, force):
-        contacts = Contacts(jnp.broadcast_to(jnp.asarray(feet), force.shape), force)
-        states = srb_spatial.rollout(BODY, state, contacts, jnp.full(steps, DT), substeps=4)
-        return jax.vmap(lambda s: momentum.lift(BODY, s, jnp.asarray(about)))(states), states.L
-
-    start = BodyState(*map(jnp.asarray, (p, R, v, L)))
-    z, L = jax.jit(jax.vmap(one))(start, jnp.asarray(force))
+    z, L = walked(BodyState(p, R, v, L), force, feet, about)
     return feet, np.asarray(z), force.reshape(count, steps, -1), np.asarray(L)
-
-
-def rollouts(model, z, u):
-    run = jax.jit(jax.vmap(lambda z, u: momentum.rollout(model, z, u)))
-    return np.asarray(run(jnp.asarray(z), jnp.asarray(u)))
 
 
 @pytest.mark.parametrize("legs", MODES.values(), ids=MODES)
 def test_edmd_finds_the_exact_model_from_400_samples(legs):
     about = np.array([0.3, -0.2, 0.0])
     feet, z, u, _ = sample(0, legs, 400, 1, about)
-    model, report = momentum.fit(z[:, 0], u[:, 0], z[:, 1])
+    model, report = fit(z[:, 0], u[:, 0], z[:, 1])
     assert report.rank == report.columns
     _, held_out, u, L = sample(1, legs, 100, STEPS, about)
-    predicted = rollouts(model, held_out[:, 0], u)
+    predicted = np.asarray(rollout(model, held_out[:, 0], u))
     span = np.ptp(held_out, axis=(0, 1))[1:]
     error = np.abs(predicted - held_out).max(axis=(0, 1))[1:]
     assert (error / span).max() < 1e-12
-    exact = momentum.exact_model(BODY, jnp.asarray(feet), jnp.asarray(about), DT)
+    exact = exact_model(BODY, feet, about, DT)
     np.testing.assert_allclose(model.B, exact.B, atol=1e-13)
-    got = jax.vmap(lambda z: momentum.angular_momentum(BODY, z, jnp.asarray(about)))(
-        jnp.asarray(predicted[:, -1])
-    )
+    got = angular_momentum(BODY, predicted[:, -1], about)
     np.testing.assert_allclose(got, L[:, -1], atol=1e-11)
 
 
 def test_far_from_the_origin_a_point_near_the_robot_keeps_the_digits():
     about = np.array([1000.0, -500.0, 20.0])
     feet, z, u, _ = sample(2, MODES["trot"], 50, STEPS, about)
-    model = momentum.exact_model(BODY, jnp.asarray(feet), jnp.asarray(about), DT)
-    predicted = rollouts(model, z[:, 0], u)
+    model = exact_model(BODY, feet, about, DT)
+    predicted = np.asarray(rollout(model, z[:, 0], u))
     np.testing.assert_allclose(predicted[..., momentum.H], z[..., momentum.H], atol=1e-9)
     orbital = 12.743 * np.cross(about, z[..., momentum.V])
     assert np.abs(z[..., momentum.H]).max() < 100.0 < np.abs(orbital).max()

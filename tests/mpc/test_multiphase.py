@@ -25,6 +25,10 @@ DURATION = (0.1, 0.1, 0.05, 0.1)  # s
 
 
 predict = jax.jit(horizon.predict)
+preview = jax.jit(gait.preview, static_argnums=2)
+build_nodes = jax.jit(horizon.build_nodes, static_argnums=(3, 4))
+response = jax.jit(multiphase.response)
+force_rows = jax.jit(multiphase.force_rows)
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +69,13 @@ def schedule(config):
 
 
 def clock_at(phase, elapsed, cycle=10):
-    index = [jnp.asarray(i, jnp.int32) for i in (BOUND, phase, cycle)]
-    return gait.Clock(*index, elapsed=jnp.asarray(elapsed, float))
+    index = [np.asarray(i, np.int32) for i in (BOUND, phase, cycle)]
+    return gait.Clock(*index, elapsed=np.asarray(elapsed, float))
 
 
 def nodes_at(params, schedule, phase, elapsed, cycle=10):
     clock = clock_at(phase, elapsed, cycle)
-    return horizon.build_nodes(params, schedule, clock, COUNT, 0.0025)
+    return jax.tree.map(np.asarray, build_nodes(params, schedule, clock, COUNT, 0.0025))
 
 
 @pytest.fixture(scope="module")
@@ -85,17 +89,17 @@ def forecast_of(params):
             x,
             horizon.HorizonCommand(
                 position=x[0],
-                velocity=jnp.asarray(velocity),
-                target=jnp.asarray(command),
-                slew=jnp.asarray(slew),
-                height=jnp.asarray(0.27),
-                periodic=jnp.zeros((COUNT, 4)),
+                velocity=velocity,
+                target=command,
+                slew=np.asarray(slew),
+                height=np.asarray(0.27),
+                periodic=np.zeros((COUNT, 4)),
             ),
             horizon.Stances(
-                ground=jnp.asarray(0.0),
-                feet=jnp.asarray(contact),
-                duration=jnp.asarray(DURATION)[nodes.phase],
-                cycle=jnp.asarray(0.35),
+                ground=np.asarray(0.0),
+                feet=np.asarray(contact),
+                duration=np.asarray(DURATION)[nodes.phase],
+                cycle=np.asarray(0.35),
             ),
         )
 
@@ -107,7 +111,7 @@ def forecast_of(params):
     [(FRONT, 0.0), (FRONT, 0.03), (FRONT, 0.099), (FIRST_FLIGHT, 0.05), (REAR, 0.013)],
 )
 def test_the_preview_holds_one_cycle_that_ends_where_it_began(schedule, phase, elapsed):
-    ahead = gait.preview(schedule, clock_at(phase, elapsed), 0.0)
+    ahead = preview(schedule, clock_at(phase, elapsed), 0.0)
     np.testing.assert_allclose(ahead.duration.sum(), 0.35, atol=1e-12)
     np.testing.assert_allclose(ahead.duration[0], DURATION[phase] - elapsed, atol=1e-12)
     np.testing.assert_allclose(ahead.duration[-1], elapsed, atol=1e-12)
@@ -117,7 +121,7 @@ def test_the_preview_holds_one_cycle_that_ends_where_it_began(schedule, phase, e
 
 def test_the_preview_of_a_ramp_takes_the_next_cycles_longer_flights(schedule):
     # The flights are at 0.3 of their length in cycle 0 and grow by 0.07 per cycle.
-    ahead = gait.preview(schedule, clock_at(SECOND_FLIGHT, 0.01, cycle=0), 0.0)
+    ahead = preview(schedule, clock_at(SECOND_FLIGHT, 0.01, cycle=0), 0.0)
     np.testing.assert_allclose(ahead.duration[:4], [0.02, 0.1, 0.037, 0.05], atol=1e-12)
     assert ahead.cycle.tolist() == [0, 1, 1, 1, 1]
 
@@ -154,11 +158,11 @@ def test_the_predicted_motion_is_the_rigid_bodys_under_the_same_moments(
     # Independent integration of the body with forces in the world frame, the moment arm of each
     # node taken from the forecast's path: the linear response must be exact.
     nodes = nodes_at(params, schedule, FRONT, 0.04)
-    x = jnp.array([0.3, 0.26, 0.1, 0.5, -0.3, 1.2])
+    x = np.array([0.3, 0.26, 0.1, 0.5, -0.3, 1.2])
     forecast = forecast_of(nodes, x, velocity=0.4, contact=((0.36, 0.0), (0.2, 0.01)))
-    free, forced = multiphase.response(params, nodes, forecast, x)
+    free, forced = map(np.asarray, response(params, nodes, forecast, x))
     force = np.random.default_rng(0).normal(size=(COUNT, 2)) * [40, 100]
-    states = np.asarray(free + jnp.einsum("kajf,jf->ka", forced, jnp.asarray(force)))
+    states = free + np.einsum("kajf,jf->ka", forced, force)
 
     m, inertia = float(go1.PARAMS.mass), float(go1.PARAMS.pitch_inertia) * 0.87
     now = np.asarray(x)
@@ -177,7 +181,7 @@ def test_the_predicted_motion_is_the_rigid_bodys_under_the_same_moments(
 @pytest.mark.parametrize("slew", [2.0, np.inf])
 def test_the_reference_follows_the_command_at_its_slew(params, schedule, forecast_of, slew):
     nodes = nodes_at(params, schedule, FRONT, 0.0)
-    x = jnp.array([0.0, 0.27, 0.0, 0.1, 0.0, 0.0])
+    x = np.array([0.0, 0.27, 0.0, 0.1, 0.0, 0.0])
     forecast = forecast_of(nodes, x, velocity=0.1, command=0.5, slew=slew)
     t = np.asarray(nodes.end)
     wanted = np.minimum(0.1 + slew * t, 0.5)
@@ -192,7 +196,7 @@ def test_feet_in_stance_are_where_they_were_measured_and_coming_ones_at_raiberts
     params, schedule, forecast_of
 ):
     nodes = nodes_at(params, schedule, FRONT, 0.05)
-    x = jnp.array([1.0, 0.27, 0.0, 0.6, 0.0, 0.0])
+    x = np.array([1.0, 0.27, 0.0, 0.6, 0.0, 0.0])
     contact = ((1.07, 0.02), (0.9, 0.0))
     forecast = forecast_of(nodes, x, velocity=0.6, command=0.6, contact=contact)
     foot, phase, present = (np.asarray(a) for a in (forecast.foot, nodes.phase, nodes.present))
@@ -208,10 +212,10 @@ def test_feet_in_stance_are_where_they_were_measured_and_coming_ones_at_raiberts
 def test_torque_rows_are_c_mujocos_jacobian(params, schedule, forecast_of, planar_go1, end):
     phase = REAR if end else FRONT
     nodes = nodes_at(params, schedule, phase, 0.0)
-    x = jnp.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
+    x = np.array([0.0, 0.25, 0.1, 0.0, 0.0, 0.0])
     forecast = forecast_of(nodes, x, contact=((0.15, 0.0), (-0.2, 0.0)))
-    lever = jnp.array([0.01, -0.02])
-    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, forecast, lever)
+    lever = np.array([0.01, -0.02])
+    rows, limit = force_rows(params, go1.PARAMS, nodes, forecast, lever)
     np.testing.assert_allclose(limit, [0, 0, 0.95 * 23.7, 0.95 * 35.55], rtol=1e-12)
 
     # Put MuJoCo's trunk where node 0 expects it and turn the joints until the foot is there.
@@ -243,17 +247,20 @@ def test_torque_rows_are_c_mujocos_jacobian(params, schedule, forecast_of, plana
 def plan(params, schedule, forecast_of):
     """A solved plan of a moving robot in front stance, with all that went in."""
     nodes = nodes_at(params, schedule, FRONT, 0.02)
-    x = jnp.array([0.0, 0.262, -0.08, 0.3, -0.1, -0.3])
+    x = np.array([0.0, 0.262, -0.08, 0.3, -0.1, -0.3])
     forecast = forecast_of(nodes, x, velocity=0.3, command=1.0)
-    lever = jnp.array([0.0, -0.018])
+    lever = np.array([0.0, -0.018])
 
     spec = CycleSpec(nodes=COUNT - 1, tolerance=1e-9, max_iterations=40)
 
     @jax.jit
-    def solve(params):
-        return multiphase.solve(params, go1.PARAMS, nodes, forecast, x, lever, spec)
+    def run(params, robot, nodes, forecast, x, lever):
+        return multiphase.solve(params, robot, nodes, forecast, x, lever, spec)
 
-    rows, limit = multiphase.force_rows(params, go1.PARAMS, nodes, forecast, lever)
+    def solve(params):
+        return run(params, go1.PARAMS, nodes, forecast, x, lever)
+
+    rows, limit = force_rows(params, go1.PARAMS, nodes, forecast, lever)
     return solve, nodes, forecast, rows, limit
 
 
@@ -304,7 +311,7 @@ def test_an_outlook_has_derivatives_where_the_reference_has_arrived(
 ):
     """Reverse mode by velocity and command, against differences; at the kink from one side."""
     nodes = nodes_at(params, schedule, FRONT, 0.03)
-    x = jnp.array([0.1, 0.27, 0.02, 0.35, -0.1, 0.4])
+    x = np.array([0.1, 0.27, 0.02, 0.35, -0.1, 0.4])
 
     @jax.jit
     def total(velocity, command):
