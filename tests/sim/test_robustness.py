@@ -26,12 +26,13 @@ WALK = {
     "command.v_x": [0.0, 0.3],
     "sim.contacts": "feet",
 }
+BOX = {"lmpc.friction": np.inf, "lmpc.torque_fraction": np.inf}
 PLACES = [(0.0, 0.0), (10.0, 3.0), (1e3, -0.27), (1e4, -2.0)]  # m: start, floor
 
 
 @pytest.mark.slow
 def test_neither_the_place_nor_the_height_of_the_floor_matters():
-    base = load_config(RunConfig, None, WALK | {"sim.base": "planar"})
+    base = load_config(RunConfig, None, WALK | BOX | {"sim.base": "planar"})
     configs = [
         dataclasses.replace(base, sim=dataclasses.replace(base.sim, start=(x, 0.0), floor=z))
         for x, z in PLACES
@@ -48,7 +49,7 @@ def test_neither_the_place_nor_the_height_of_the_floor_matters():
 @pytest.mark.slow
 def test_neither_place_nor_heading_matters_on_the_free_base():
     keys = {"noise.enabled": False, "sim.cone": "elliptic"}
-    base = load_config(RunConfig, None, WALK | keys)
+    base = load_config(RunConfig, None, WALK | BOX | keys)
     starts = [(0.0, (0.0, 0.0), 0.0), (1.0, (0.0, 0.0), 0.0), (2.0, (1e3, -50.0), -0.27)]
     configs = [
         dataclasses.replace(
@@ -62,15 +63,14 @@ def test_neither_place_nor_heading_matters_on_the_free_base():
         np.testing.assert_allclose(recording.log.x[:, other], recording.log.x[:, 0], atol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("slope", [8.0, -8.0])
-def test_it_walks_up_and_down_a_slope(slope):
+@pytest.fixture(scope="module")
+def sloping():
     keys = {
         "duration": 10.0,
         "command.times": [0.0, 1.0],
         "command.v_x": [0.0, 0.3],
         "terrain.kind": "slope",
-        "terrain.slope": slope,
+        "terrain.slope": 8.0,
         "terrain.start": 0.5,
         "terrain.end": 2.0,
         "lmpc.model_dt": 0.02,
@@ -78,11 +78,15 @@ def test_it_walks_up_and_down_a_slope(slope):
         "lmpc.Q": [1.815, 18.15, 50.0, 8.358, 4.179, 4.606],
         "leg.swing_height": 0.2347,
     }
-    config = load_config(RunConfig, None, keys)
-    result = metrics(
-        simulate(MujocoEngine(batch_spec(config)), resolve_episode(config, seed=1)),
-        resolve_goal(config),
-    )
+    return keys, MujocoEngine(batch_spec(load_config(RunConfig, None, keys)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("slope", [8.0, -8.0])
+def test_it_walks_up_and_down_a_slope(sloping, slope):
+    keys, engine = sloping
+    config = load_config(RunConfig, None, keys | {"terrain.slope": slope})
+    result = metrics(simulate(engine, resolve_episode(config, seed=1)), resolve_goal(config))
     assert not result["fell"]
     assert result["crossed"]
     assert result["pitch_max_deg"] < 12.0
