@@ -25,7 +25,8 @@ def small(repository):
 
 @pytest.mark.slow
 def test_a_tuning_leaves_a_config_a_verdict_and_pictures(call, small, tmp_path):
-    assert call(study.main, *small, "--out", tmp_path) == 0
+    box = ("--lmpc.friction", "inf", "--lmpc.torque_fraction", "inf")
+    assert call(study.main, *small, *box, "--worsen", "10", "--out", tmp_path) == 0
     record = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert set(record["mujoco"]) == {"own", "start", "gradient"}
     assert all(entry["runs"] == 2 for entry in record["mujoco"].values())
