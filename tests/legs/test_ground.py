@@ -1,5 +1,6 @@
 """The ground's slope from footholds, against planes that are known."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from kjax.legs import ground
 
 RADIUS = 0.023
+start_slope, next_slope = jax.jit(ground.start_slope), jax.jit(ground.next_slope)
 HOLDS = np.array([[0.21, -0.12, 0.0], [0.17, 0.14, 0.0], [-0.2, -0.15, 0.0], [-0.16, 0.11, 0.0]])
 
 
@@ -17,18 +19,18 @@ def on(slope, height=-0.3):
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, -0.1), (-0.2, 0.36)])
 def test_footholds_on_a_plane_tell_its_slope(slope):
-    known = ground.start_slope(jnp.asarray(RADIUS), jnp.asarray(on((0.0, 0.0))))
-    seen = ground.next_slope(known, jnp.asarray(on(slope)), jnp.ones(4, bool), jnp.asarray(1.0))
+    known = start_slope(jnp.asarray(RADIUS), jnp.asarray(on((0.0, 0.0))))
+    seen = next_slope(known, jnp.asarray(on(slope)), jnp.ones(4, bool), jnp.asarray(1.0))
     np.testing.assert_allclose(seen.slope, slope, rtol=2e-3, atol=1e-12)
     # A tenth of the way with each call.
-    part = ground.next_slope(known, jnp.asarray(on(slope)), jnp.ones(4, bool), jnp.asarray(0.1))
+    part = next_slope(known, jnp.asarray(on(slope)), jnp.ones(4, bool), jnp.asarray(0.1))
     np.testing.assert_allclose(part.slope, 0.1 * seen.slope, rtol=1e-12, atol=1e-15)
 
 
 def test_feet_in_the_air_are_remembered_where_they_stood():
-    known = ground.start_slope(jnp.asarray(RADIUS), jnp.asarray(on((0.2, 0.0))))
+    known = start_slope(jnp.asarray(RADIUS), jnp.asarray(on((0.2, 0.0))))
     lifted = jnp.asarray(on((0.2, 0.0))).at[0, 2].add(0.1)
-    seen = ground.next_slope(known, lifted, jnp.array([False, True, True, True]), jnp.asarray(1.0))
+    seen = next_slope(known, lifted, jnp.array([False, True, True, True]), jnp.asarray(1.0))
     np.testing.assert_allclose(seen.holds[0], known.holds[0])
     motion = jnp.array([0.1, -0.2, 0.05])
     later = ground.moved(known, motion)
@@ -50,7 +52,7 @@ def test_a_foot_touches_a_slope_along_its_normal():
 
 def test_parallel_feet_that_say_nothing_of_a_direction_tell_no_slope_there():
     line = HOLDS * [1.0, 0.0, 0.0] + [0.0, 0.0, 0.05] * np.array([[1], [-1], [1], [-1]])
-    known = ground.start_slope(jnp.asarray(RADIUS), jnp.asarray(HOLDS))
-    seen = ground.next_slope(known, jnp.asarray(line), jnp.ones(4, bool), jnp.asarray(1.0))
+    known = start_slope(jnp.asarray(RADIUS), jnp.asarray(HOLDS))
+    seen = next_slope(known, jnp.asarray(line), jnp.ones(4, bool), jnp.asarray(1.0))
     assert np.abs(seen.slope).max() <= ground.STEEPEST
     assert seen.slope[1] == pytest.approx(0.0, abs=1e-9)

@@ -91,9 +91,10 @@ def test_feet_do_not_pull_and_stay_within_the_friction_limit():
 
 
 def test_derivatives_are_finite_with_feet_that_press_nothing_and_agree_with_differences():
-    wrench = jnp.asarray(wrench_of(PLANNED) + np.array([1.0, 8.0, 4.0, 3.0, -2.0, 1.5]))
-    planned = jnp.asarray(PLANNED * TROT[:, None])
+    wrench = wrench_of(PLANNED) + np.array([1.0, 8.0, 4.0, 3.0, -2.0, 1.5])
+    planned = PLANNED * TROT[:, None]
 
+    @jax.jit
     def total(wrench, planned):
         force = lateral.distribute(
             settings(), jnp.asarray(ARMS), jnp.asarray(TROT), planned, wrench
@@ -101,7 +102,7 @@ def test_derivatives_are_finite_with_feet_that_press_nothing_and_agree_with_diff
         return jnp.sum(force**2)
 
     for argument, values in enumerate((wrench, planned)):
-        slope = np.asarray(jax.grad(total, argument)(wrench, planned))
+        slope = np.asarray(jax.jit(jax.grad(total, argument))(wrench, planned))
         assert np.isfinite(slope).all()
         for index in ((1,), (4,)) if argument == 0 else ((0, 0), (3, 2)):
             step = np.zeros(values.shape)
