@@ -373,7 +373,14 @@ def _as_left(name: str) -> Callable[[], str]:
     return left
 
 
-for _name in ("tune_trot", "tune_bound", "learn_control", "spatial", "spatial_models"):
+for _name in (
+    "tune_trot",
+    "tune_bound",
+    "learn_control",
+    "spatial",
+    "spatial_mjx",
+    "spatial_models",
+):
     table(_as_left(_name))
 
 

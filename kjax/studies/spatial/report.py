@@ -76,6 +76,7 @@ def _draw_pushes(ax: Any, rows: list[Row]) -> None:
     ax.set_theta_zero_location("N")
     ax.set_thetagrids(DIRECTIONS, ["ahead", "", "left", "", "behind", "", "right", ""])
     ax.set_rlim(0.0)
+    ax.set_rlabel_position(112.0)  # between two of the directions
     ax.set_title("push at the weakest phase [N s]", pad=16)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="lower left", bbox_to_anchor=(-0.2, -0.15))
