@@ -346,9 +346,9 @@ def solve(
     away = jnp.where(used, (base - targets.force[where]).reshape(-1), 0.0)
     q = 2.0 * (weighted.T @ error.reshape(-1) + cost * away)
 
-    solution = qp.solve_rows(
+    solution = qp.solve_block_rows(
         H, q, *_row_problem(rows, listed, base),
-        method="active_set", tolerance=tolerance, max_iterations=max_iterations,
+        tolerance=tolerance, max_iterations=max_iterations,
     )  # fmt: skip
     change = jnp.where(used, solution.x, 0.0).reshape(-1, 3)
     force = nominal.at[where].add(change)
@@ -378,15 +378,12 @@ def _condensed(response: Response, listed: FootNodes) -> Float[Array, "K n force
 
 def _row_problem(
     rows: FootRows, listed: FootNodes, base: Float[Array, "F 3"]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Rows with their bounds, and the box, of the changes of the listed forces."""
-    F, r = base.shape[0], rows.low.shape[0]
+) -> tuple[qp.BlockRows, Array, Array]:
+    """Rows, and the box, of the changes of the listed forces."""
     own = rows.matrix[listed.node, listed.leg] * listed.used[:, None, None]  # (F, r, 3)
-    matrix = jnp.einsum("frc,fg->frgc", own, jnp.eye(F, dtype=base.dtype)).reshape(F * r, 3 * F)
     value = jnp.einsum("frc,fc->fr", own, base)
-    low_row, high_row = ((bound[None] - value).reshape(-1) for bound in (rows.low, rows.high))
     free = jnp.full_like(base[:, :2], jnp.inf)
     low = jnp.concatenate([-free, (rows.force_z[0] - base[:, 2])[:, None]], axis=1)
     high = jnp.concatenate([free, (rows.force_z[1] - base[:, 2])[:, None]], axis=1)
     low, high = (jnp.where(listed.used[:, None], a, 0.0).reshape(-1) for a in (low, high))
-    return matrix, low_row, high_row, low, high
+    return qp.BlockRows(own, rows.low[None] - value, rows.high[None] - value), low, high

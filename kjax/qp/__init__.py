@@ -1,5 +1,6 @@
 """Convex quadratic programs with a box, or with general rows; this package knows no robot."""
 
+from kjax.qp.block_rows import BlockRows, solve_block_rows
 from kjax.qp.box import METHODS, Method, solve
 from kjax.qp.box_rows import BoxRowSolution, solve_rows_from_box
 from kjax.qp.problem import (
@@ -19,6 +20,7 @@ __all__ = [
     "METHODS",
     "ROW_METHODS",
     "STATUS_TEXT",
+    "BlockRows",
     "BoxRowSolution",
     "Method",
     "MethodUsed",
@@ -31,6 +33,7 @@ __all__ = [
     "kkt_residual",
     "prepare",
     "solve",
+    "solve_block_rows",
     "solve_rows",
     "solve_rows_from_box",
     "start",

@@ -115,11 +115,16 @@ class Factor(NamedTuple):
 
 def factorise(problem: RowProblem) -> Factor:
     """Cholesky factor of the problem's H."""
-    n, dtype = problem.q.shape[0], problem.q.dtype
+    return factorise_matrix(problem.H)
+
+
+def factorise_matrix(H: Float[Array, "n n"]) -> Factor:
+    """Cholesky factor of a Hessian."""
+    n, dtype = H.shape[0], H.dtype
     eps = float(jnp.finfo(dtype).eps)
-    curvature = jnp.max(jnp.diagonal(problem.H))
+    curvature = jnp.max(jnp.diagonal(H))
     curvature = jnp.where(curvature > 0, curvature, 1.0)
-    L = cholesky(problem.H / curvature)
+    L = cholesky(H / curvature)
     definite = (jnp.diagonal(L) > (n * eps) ** 0.5).all()
     return Factor(jnp.where(definite, L, jnp.eye(n, dtype=dtype)), curvature, definite)
 

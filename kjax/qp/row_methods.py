@@ -5,7 +5,7 @@ with ``kkt_errors`` of just that point.
 """
 
 from enum import IntEnum
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,10 @@ class RowSettings(NamedTuple):
     method: RowMethod
     tolerance: float
     max_iterations: int
+
+    def reachable(self, dtype: Any) -> "RowSettings":
+        """These with a tolerance that the type's rounding allows."""
+        return self._replace(tolerance=max(self.tolerance, 20.0 * float(jnp.finfo(dtype).eps)))
 
 
 class Posed(NamedTuple):

@@ -291,16 +291,37 @@ def rows_error(
     x: Float[Array, "n"],
 ) -> Float[Array, ""]:
     """The primal part of ``kkt_errors``, of the rows alone."""
-    n = x.shape[0]
-    rounding = 4.0 * n**0.5 * float(jnp.finfo(x.dtype).eps)
-    size_C, value = jnp.abs(C), C @ x
+    size_C = jnp.abs(C)
+    terms = RowTerms(C @ x, size_C @ jnp.abs(x), size_C @ d)
+    return largest_violation(terms, low, high, jnp.max(jnp.abs(x) / d), x.shape[0])
+
+
+class RowTerms(NamedTuple):
+    """Rows of any layout at a point.
+
+    Attributes:
+      value: of the rows.
+      size: sum of the sizes of its terms.
+      unit: the same for a point of the expected size.
+    """
+
+    value: Array
+    size: Array
+    unit: Array
+
+
+def largest_violation(
+    terms: RowTerms, low: Array, high: Array, reach: Float[Array, ""], n: int
+) -> Float[Array, ""]:
+    """The primal part of ``kkt_errors``, of n variables that reach so far in expected sizes."""
+    value, size, unit = terms
+    rounding = 4.0 * n**0.5 * float(jnp.finfo(value.dtype).eps)
     violated = jnp.maximum(low - value, value - high)
-    reach = jnp.max(jnp.abs(x) / d)
     far = is_far(reach)
-    noise = jnp.where(far, 0.0, rounding * reach * (size_C @ d))
+    noise = jnp.where(far, 0.0, rounding * reach * unit)
     bound = jnp.where(violated > 0, jnp.where(low > value, low, high), 0.0)
-    terms = jnp.abs(bound) + jnp.where(far, jnp.abs(value), size_C @ jnp.abs(x))
-    return jnp.max(_ratio(violated - noise, terms), initial=0.0)
+    whole = jnp.abs(bound) + jnp.where(far, jnp.abs(value), size)
+    return jnp.max(_ratio(violated - noise, whole), initial=0.0)
 
 
 def _ratio(part: Array, whole: Array) -> Array:

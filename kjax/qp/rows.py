@@ -151,7 +151,7 @@ class _Qp(NamedTuple):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _differentiable(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
-    return _solve(settings, warm, qp)
+    return solve_data(settings, warm, qp.stacked())
 
 
 @_differentiable.defjvp
@@ -160,22 +160,26 @@ def _derivative(settings: RowSettings, primals: Any, tangents: Any) -> tuple[Any
     warm, qp = primals
     _, d_qp = tangents
     solution = _differentiable(settings, warm, qp)
-    data, change = qp.stacked(), d_qp.stacked()
+    return solution, derivative(solution, qp.stacked(), d_qp.stacked())
+
+
+def derivative(solution: RowSolution, data: RowData, change: RowData) -> RowSolution:
+    """Change of a solution with its data, by the rows that are active."""
     good = solution.status <= Status.ITERATION_LIMIT
     x, y = solution.x, solution.multipliers
     equations = jax.lax.stop_gradient(active_equations(data, x, y, good))
     dx, dy = solve_equations(equations.H, equations.A, *equations.right_sides(change, x, y))
     still = jax.tree.map(no_tangent, solution)
-    return solution, still._replace(
+    return still._replace(
         x=jnp.where(good, dx * equations.unit_x, 0.0),
         multipliers=jnp.where(equations.active, dy * equations.unit_y, 0.0),
     )
 
 
-def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
-    least = 20.0 * float(jnp.finfo(qp.q.dtype).eps)
-    settings = settings._replace(tolerance=max(settings.tolerance, least))
-    data, good, finite, consistent = _checked(qp.stacked())
+def solve_data(settings: RowSettings, warm: Array | None, asked: RowData) -> RowSolution:
+    """``solve_rows`` of a problem whose bounds are stacked, without derivatives."""
+    settings = settings.reachable(asked.q.dtype)
+    data, good, finite, consistent = _checked(asked)
     # step 1; the active set wants curvature everywhere, and needs no other units then
     by_curvature = settings.method in ("auto", "active_set")
     posed = pose(data, good, equilibrate=not by_curvature)
@@ -219,7 +223,7 @@ def _solve(settings: RowSettings, warm: Array | None, qp: _Qp) -> RowSolution:
     x = jnp.where(usable, jnp.where(verdict.unbounded, verdict.x, found.x), posed.scaling.at)
     error = jnp.where(usable, found.error, jnp.inf)
     return RowSolution(
-        x=_inside(x, qp, consistent),
+        x=_inside(x, asked, consistent),
         multipliers=jnp.where(usable & jnp.isfinite(found.y), found.y, 0.0),
         status=status.astype(jnp.int32),
         primal=error[0],
@@ -248,11 +252,12 @@ def _checked(data: RowData) -> tuple[RowData, Array, Array, Array]:
     return safe, good, finite, consistent
 
 
-def _inside(x: Array, qp: _Qp, consistent: Array) -> Array:
+def _inside(x: Array, asked: RowData, consistent: Array) -> Array:
     """A finite point inside the bounds that make sense, whatever the data."""
+    m = asked.C.shape[0]
     inside, outside = (
         jnp.where(consistent & ~jnp.isnan(bound), bound, end)
-        for bound, end in ((qp.lower, -jnp.inf), (qp.upper, jnp.inf))
+        for bound, end in ((asked.low[m:], -jnp.inf), (asked.high[m:], jnp.inf))
     )
     return jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), inside, outside)
 
