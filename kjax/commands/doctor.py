@@ -84,10 +84,9 @@ def packages() -> Iterator[Finding]:
 
 def threads() -> Finding:
     """Cores, and how many threads XLA would use."""
-    if hasattr(os, "sched_getaffinity"):
-        cores = len(os.sched_getaffinity(0))
-    else:
-        cores = os.cpu_count() or 1
+    from kjax.threads import usable_cores
+
+    cores = usable_cores()
     chosen = os.environ.get("NPROC")
     text = f"{cores} cores, NPROC {'= ' + chosen if chosen else 'not set'}"
     if chosen is None:

@@ -30,7 +30,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from kjax.qp.batching import where_needed, while_any
-from kjax.qp.lapack import cholesky, cholesky_solve, inverse_of_lower
+from kjax.qp.factor import Factor
+from kjax.qp.lapack import inverse_of_lower
 from kjax.qp.row_problem import RowProblem
 
 ROUNDS = 3  # of steps 2 to 5; one is usual
@@ -97,41 +98,6 @@ class _Sizes(NamedTuple):
 
     flat: Array
     outside: Array
-
-
-class Factor(NamedTuple):
-    """H in triangles, L L^T = H / curvature.
-
-    Attributes:
-      L: (n, n) lower triangle; the identity where H is not definite.
-      curvature: largest of H's diagonal.
-      definite: whether H is positive definite to working precision.
-    """
-
-    L: Float[Array, "n n"]
-    curvature: Float[Array, ""]
-    definite: Bool[Array, ""]
-
-
-def factorise(problem: RowProblem) -> Factor:
-    """Cholesky factor of the problem's H."""
-    return factorise_matrix(problem.H)
-
-
-def factorise_matrix(H: Float[Array, "n n"]) -> Factor:
-    """Cholesky factor of a Hessian."""
-    n, dtype = H.shape[0], H.dtype
-    eps = float(jnp.finfo(dtype).eps)
-    curvature = jnp.max(jnp.diagonal(H))
-    curvature = jnp.where(curvature > 0, curvature, 1.0)
-    L = cholesky(H / curvature)
-    definite = (jnp.diagonal(L) > (n * eps) ** 0.5).all()
-    return Factor(jnp.where(definite, L, jnp.eye(n, dtype=dtype)), curvature, definite)
-
-
-def unconstrained(problem: RowProblem, factor: Factor) -> Float[Array, "n"]:
-    """Minimiser (n,) without any rows."""
-    return -cholesky_solve(factor.L, problem.q) / factor.curvature
 
 
 def solve_active_set(

@@ -16,9 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from kjax.precision import full_precision
-from kjax.qp.active_set import factorise_matrix
 from kjax.qp.batching import where_needed
-from kjax.qp.lapack import cholesky_solve
+from kjax.qp.factor import factorise, unconstrained
 from kjax.qp.problem import Status
 from kjax.qp.row_methods import MethodUsed, RowSettings
 from kjax.qp.row_problem import RowData, RowTerms, kkt_errors, largest_violation, variable_units
@@ -119,9 +118,9 @@ def _without_rows(settings: RowSettings, qp: _Qp) -> tuple[RowSolution, Bool[Arr
     n, (F, r, b) = q.shape[0], rows.matrix.shape
     H = 0.5 * (H + H.T)
     d = variable_units(H, jnp.zeros((0, n), q.dtype), jnp.ones((n,), bool))
-    factor = factorise_matrix(H * (d[:, None] * d[None]))
+    factor = factorise(H * (d[:, None] * d[None]))
     slope = jnp.max(jnp.abs(q * d))
-    x = -d * cholesky_solve(factor.L, q * d) / factor.curvature
+    x = d * unconstrained(factor, q * d)
     # Expected sizes, as ``scale_rows`` has them where no bound is near.
     d = d * jnp.where(slope > 0, slope / factor.curvature, 1.0)
     box = RowData(H, q, jnp.zeros((0, n), q.dtype), lower, upper)

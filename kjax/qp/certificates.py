@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from kjax.qp.active_set import factorise, farkas, solve_active_set
+from kjax.qp.active_set import farkas, solve_active_set
+from kjax.qp.factor import factorise
 from kjax.qp.row_problem import RowProblem
 
 
@@ -65,7 +66,7 @@ def classify(problem: RowProblem, good: Array) -> Verdict:
             has_low=has_low, has_high=has_high, equal=equal,
         )  # fmt: skip
         eps, limit = float(jnp.finfo(dtype).eps), 10 * (2 * n + m)
-        found = solve_active_set(one, factorise(one), good, eps, limit)
+        found = solve_active_set(one, factorise(one.H), good, eps, limit)
         return found.x, found.infeasible, farkas(one, found)
 
     # No vmap: a loop of two is one compiled body as well, and neither waits for the other.

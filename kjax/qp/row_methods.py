@@ -11,16 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from kjax.qp.active_set import (
-    ActiveSet,
-    Factor,
-    factorise,
-    farkas,
-    solve_active_set,
-    unconstrained,
-)
+from kjax.qp.active_set import ActiveSet, farkas, solve_active_set
 from kjax.qp.batching import where_needed
 from kjax.qp.certificates import Verdict, classify, proves_infeasible
+from kjax.qp.factor import Factor, factorise, unconstrained
 from kjax.qp.interior import solve_interior_point
 from kjax.qp.lapack import cholesky
 from kjax.qp.polish import polish
@@ -134,8 +128,8 @@ def pose(data: RowData, good: Array, *, equilibrate: bool = True) -> Posed:
 
 def without_rows(posed: Posed) -> tuple[Found, Factor]:
     """The unconstrained minimiser, often the solution; and the factor of H."""
-    factor = factorise(posed.problem)
-    x = unconstrained(posed.problem, factor)
+    factor = factorise(posed.problem.H)
+    x = unconstrained(factor, posed.problem.q)
     found = Found(
         *_judge_inside(posed, x, jnp.zeros_like(posed.problem.low)),
         usable=factor.definite | ~posed.good,

@@ -26,9 +26,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from kjax.precision import full_precision
-from kjax.qp.active_set import Factor
 from kjax.qp.batching import where_needed
 from kjax.qp.certificates import Verdict
+from kjax.qp.factor import Factor
 from kjax.qp.polish import solve_equations
 from kjax.qp.problem import Status, no_tangent
 from kjax.qp.row_derivative import active_equations

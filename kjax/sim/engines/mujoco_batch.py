@@ -8,7 +8,6 @@ Every robot has its own ``MjModel``, so terrain, friction and payload may differ
 that of a single run to the last bit.
 """
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -44,6 +43,7 @@ from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, empty_log, recording_of_ticks
 from kjax.sim.scene import build_model
 from kjax.sim.tick_stats import TickStats, empty_stats, empty_windows
+from kjax.threads import usable_cores
 
 _WAIT = 0.1  # s between two looks at the threads
 _READ = 10  # ticks whose physics steps are read in one call
@@ -98,7 +98,7 @@ class BatchEngine:
         if threads is not None and threads < 1:
             raise ValueError(f"threads must be at least 1, got {threads}")
         self.spec, self.torques, self.dtype = spec, torques, np.dtype(dtype)
-        self.threads = _cores() if threads is None else threads
+        self.threads = usable_cores() if threads is None else threads
         robot = get_robot(spec.scene.robot)
         self.model = build_model(robot, spec.scene, visual=False)
         self._loop = build_closed_loop(robot, spec, self.model, held=torques == "held")
@@ -394,9 +394,3 @@ def _run_threads(groups: list[_Group], stop: Event, on_progress: OnProgress | No
     for future in futures:
         future.result()
     return interrupted
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
