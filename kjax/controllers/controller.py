@@ -179,7 +179,7 @@ def _init_from(
         velocity=jnp.zeros((3,), zero.dtype),
         correction=jnp.zeros((2 if spec.spatial is None else 3,), zero.dtype),
         memory=(
-            start_memory(tables.lmpc, spec)
+            _start_lmpc(tables, spec)
             if spec.spatial is None
             else start_spatial(spec.spatial, zero.dtype)
         ),
@@ -194,6 +194,11 @@ def _init_from(
     )
     # A buffer of its own for every leaf, so that the state may be donated.
     return jax.tree.map(jnp.copy, state)
+
+
+def _start_lmpc(tables: Tables, spec: ControllerSpec) -> LmpcMemory:
+    assert tables.lmpc is not None  # a planar controller's are condensed
+    return start_memory(tables.lmpc, spec)
 
 
 def _plan(

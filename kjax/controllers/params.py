@@ -75,7 +75,7 @@ class ControllerParams(NamedTuple):
 
     Attributes:
       robot: geometry and masses.
-      fits: prediction models, of the same.
+      fits: the planar controller's prediction models; ``None`` for that in three dimensions.
       modes: weights and bounds of the LMPC within a stance, of every contact mode of every gait.
       problem: (G, P) which of these each phase of a gait is.
       uncertainty_discount: how much less its uncertain steps weigh; not read where the spec does
@@ -103,7 +103,7 @@ class ControllerParams(NamedTuple):
     """
 
     robot: RobotParams
-    fits: Fits
+    fits: Fits | None
     modes: ModeSettings
     problem: Int[Array, "G P"]
     uncertainty_discount: Float[Array, ""]
@@ -133,11 +133,11 @@ class Tables(NamedTuple):
     Attributes:
       params: parameters; those that the LMPC's tables are condensed from (fits, modes,
         uncertainty_discount) are not read any more.
-      lmpc: condensed problems within a stance, of every contact mode.
+      lmpc: the planar controller's condensed problems within a stance, of every contact mode.
     """
 
     params: ControllerParams
-    lmpc: LmpcTables
+    lmpc: LmpcTables | None
 
 
 @full_precision
@@ -182,7 +182,9 @@ def with_params(tables: Tables, **changes: Any) -> Tables:
 
 @partial(jax.jit, static_argnums=0)
 @full_precision
-def _condensed(spec: ControllerSpec, params: ControllerParams) -> LmpcTables:
+def _condensed(spec: ControllerSpec, params: ControllerParams) -> LmpcTables | None:
+    if params.fits is None:
+        return None
     return build_tables(
         params.fits.model,
         params.modes,

@@ -103,9 +103,11 @@ def _build_model_at(
             z = lift(None, start)
             if not spec.model.measured_feet:
                 return z, None
+            assert tables.lmpc is not None
             model = jax.tree.map(lambda a: a[problem], tables.lmpc.model)
             return z, model._replace(B=input_map(model, start.feet))
         fits = tables.params.fits
+        assert fits is not None
         model_params, force, _ = jax.tree.map(lambda a: a[problem], fits.prediction)
         if not spec.model.measured_feet:
             start = start._replace(feet=fits.feet[problem])
@@ -148,6 +150,7 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         last = jnp.where(fresh, 0.0, task.memory.plan[:4])
         start = Start(body.x, feet, last, rate * clock.elapsed, rate)
         problem = params.problem[clock.gait, clock.phase]
+        assert tables.lmpc is not None
         z, model = model_at(tables, problem, start)
         solution = solve_lmpc(
             tables.lmpc, problem, z, reference, task.memory, spec, model=model, rows=rows

@@ -39,7 +39,7 @@ from kjax.types import COMMAND_NAMES, MODE_ALPHA, Command, RobotParams, contact_
 def resolve(
     config: RunConfig, robot: RobotParams | None = None
 ) -> tuple[ControllerSpec, ControllerParams]:
-    """Spec and parameters of a controller; fits the Koopman models.
+    """Spec and parameters of a controller; fits the Koopman models of a planar one.
 
     A fit whose response to forces is far from the rigid body's along the LMPC's horizon is warned
     of.
@@ -59,7 +59,7 @@ def resolve(
     spec = controller_spec(config)
     check_walkable(config, robot)
     with jax.enable_x64(True):
-        fits = fit_models(config, robot)
+        fits = None if spec.spatial is not None else fit_models(config, robot)
         warn_of_fits(config, robot, fits)
         return spec, jax.device_get(gather(config, robot, fits))
 
@@ -118,7 +118,7 @@ def controller_key(config: RunConfig) -> Hashable:
     )
 
 
-def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits) -> ControllerParams:
+def gather(config: RunConfig | Overlay, robot: RobotParams, fits: Fits | None) -> ControllerParams:
     """Parameters from a config, or an ``Overlay`` with traced values, and its fits."""
     si = in_si(config, robot)
     gaits = build_gaits(si)

@@ -90,8 +90,16 @@ def _fit(
     return jax.device_get(Fits(model, body.feet, spread, prediction))
 
 
-def warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits) -> None:
+def warn_of_fits(config: RunConfig, robot: RobotParams, fits: Fits | None) -> None:
     """Warn of a model that no gait predicts with, and of a linear EDMD model that misleads."""
+    if fits is None:
+        if config.koopman.model != KoopmanConfig().model:
+            warnings.warn(
+                f"koopman.model = '{config.koopman.model}' has no effect: controller = 'spatial' "
+                "predicts with spatial.model",
+                stacklevel=3,
+            )
+        return
     gaits = build_gaits(config)
     walked = reachable_gaits(config.gaits, config.gait.names)
     uses_cycle = [config.gaits[name].horizon == "multiphase" for name in walked]

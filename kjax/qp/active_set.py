@@ -321,7 +321,7 @@ def _exchange(state: ActiveSet, problem: RowProblem, step: _Step) -> tuple[Activ
     slots = jnp.arange(n, dtype=jnp.int32)
     taken = add & (slots == jnp.argmax(state.slot_row == M))  # the first empty one
     left = drop & (slots == dropped)
-    dx = jnp.where(depends, 0.0, t) * z
+    x = state.x + jnp.where(depends, 0.0, t) * z
     y = state.y - t * r
     y = jnp.where(state.slot_equal, y, jnp.maximum(y, 0.0))
     y_chosen = state.y_chosen + t
@@ -343,8 +343,8 @@ def _exchange(state: ActiveSet, problem: RowProblem, step: _Step) -> tuple[Activ
         stack=stack,
         slot_row=jnp.where(taken, state.chosen, jnp.where(left, M, state.slot_row)),
         slot_equal=jnp.where(taken, problem.equal[state.chosen], state.slot_equal & ~left),
-        x=state.x + dx,
-        value=state.value + problem.rows(dx),
+        x=x,
+        value=problem.rows(x),  # not the old one's change: far out that would keep its rounding
         y=y,
         y_chosen=y_chosen,
         bound_status=jnp.where(

@@ -141,3 +141,11 @@ def test_a_model_that_no_gait_predicts_with_is_said(names, told):
     if told:
         assert "bound_multiphase" in text[0]
         assert "multiphase" in text[0]
+
+
+def test_in_three_dimensions_none_of_them_is_fitted_and_that_is_said():
+    keys = {"controller": "spatial", "sim.base": "free", "koopman.model": "srb"}
+    with pytest.warns(UserWarning, match="koopman.model = 'srb' has no effect"):
+        spec, params = resolve(load_config(RunConfig, None, keys))
+    assert params.fits is None
+    assert condense(spec, params).lmpc is None

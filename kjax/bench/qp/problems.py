@@ -77,7 +77,9 @@ def record_box(name: str, seconds: float, changes: dict[str, Any] | None = None)
         return plan._replace(memory=recorded)
 
     mode, q, lower, upper = map(np.stack, zip(*_drive(config, planner, seconds), strict=True))
-    hessian = condense(*resolve(config)).lmpc.hessian
+    tables = condense(*resolve(config))
+    assert tables.lmpc is not None
+    hessian = tables.lmpc.hessian
     H = np.array(hessian.H / (hessian.scale[:, :, None] * hessian.scale[:, None, :]))
     used = (upper > lower).any(axis=1)  # nothing is planned in flight
     return {
