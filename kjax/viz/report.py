@@ -159,11 +159,29 @@ def envelope_figure(axes_found: Mapping[str, Mapping[str, Any]], path: Path) -> 
                 _bracket(axis, y, one)
             axis.set_yticks(range(len(rows)), [str(one["title"]) for one in rows])
             axis.set_ylim(len(rows) - 0.4, -0.6)
-            axis.set_xlim(left=0.0)
+            axis.set_xlim(0.0, 1.08 * axis.get_xlim()[1])  # room for the numbers
             axis.set_xlabel(quantity)
+            axis.set_title(_limits_title(rows), loc="left", fontsize=8)
         fig.suptitle("dot: passed; bar: up to what failed; triangle: the end of the search passed; "
                      "stroke: limit of a phase", fontsize=8)  # fmt: skip
         _finish(fig, path)
+
+
+def _limits_title(rows: list[Mapping[str, Any]]) -> str:
+    """The finding of a panel: its lowest and its highest limit."""
+    known = sorted((one for one in rows if one["passed"] is not None), key=lambda o: o["passed"])
+    if not known:
+        return "nothing passes"
+
+    def value(one: Mapping[str, Any]) -> str:
+        unit = "" if one["unit"] == "-" else f" {one['unit']}"
+        return f"{'' if one['failed'] is not None else 'at least '}{one['passed']:.3g}{unit}"
+
+    low, high = known[0], known[-1]
+    if value(low) == value(high):
+        whose = "each" if len(known) == len(rows) > 1 else low["title"]
+        return f"{low['quantity']}: {value(low)} ({whose})"
+    return f"{low['quantity']}: {value(low)} ({low['title']}) to {value(high)} ({high['title']})"
 
 
 def _bracket(axis: Axes, y: int, one: Mapping[str, Any]) -> None:
