@@ -1,12 +1,15 @@
-"""MuJoCo's MJX, imported without its note that the optional NVIDIA Warp is not installed.
+"""MuJoCo's MJX without two of its notes that tell a user of kjax nothing.
 
 kjax uses the JAX implementation of MJX. ``mujoco.mjx`` prints to stdout that it found no Warp;
-whatever else it prints, other reasons of a failed import included, comes through.
+whatever else it prints, other reasons of a failed import included, comes through. In float32 beside
+JAX's float64 its sensors make JAX warn of a cast that is meant.
 """
 
 import contextlib
 import io
 import sys
+import warnings
+from typing import Any
 
 # What mujoco.mjx.warp prints where the package is absent, and nothing else.
 _ABSENT = frozenset(
@@ -26,4 +29,12 @@ try:
 finally:
     sys.stdout.write(pass_on(said.getvalue()))
 
-__all__ = ["mjx"]
+
+def mjx_step(model: Any, data: Any) -> Any:
+    """``mjx.step``."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "scatter inputs have incompatible types", FutureWarning)
+        return mjx.step(model, data)
+
+
+__all__ = ["mjx", "mjx_step"]

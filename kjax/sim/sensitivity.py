@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from kjax.sim.mjx_import import mjx
+from kjax.sim.mjx_import import mjx, mjx_step
 
 
 class Sensitivity(NamedTuple):
@@ -65,7 +65,7 @@ def build_sensitivity(
     def roll(y: Array, ctrl: Array) -> Array:
         data = mjx.make_data(own)
         data = data.replace(qpos=y[:nq].astype(data.qpos.dtype), qvel=y[nq:], ctrl=ctrl)
-        data = jax.lax.fori_loop(0, steps, lambda _, d: _same(mjx.step(own, d), d), data)
+        data = jax.lax.fori_loop(0, steps, lambda _, d: _same(mjx_step(own, d), d), data)
         return jnp.concatenate([data.qpos, data.qvel])
 
     def sensitivity(qpos: Array, qvel: Array, ctrl: Array) -> Sensitivity:

@@ -1,7 +1,16 @@
 import subprocess
 import sys
+import warnings
 
-from kjax.sim.mjx_import import pass_on
+import jax
+import jax.numpy as jnp
+import mujoco
+import pytest
+
+from kjax.sim.mjx_import import mjx, mjx_step, pass_on
+
+SENSES = """<mujoco><worldbody><body><freejoint/><geom size=".1"/><site name="s"/></body>
+</worldbody><sensor><gyro site="s"/><accelerometer site="s"/></sensor></mujoco>"""
 
 
 def test_only_the_note_that_warp_is_not_installed_is_kept_back():
@@ -16,3 +25,17 @@ def test_importing_what_uses_mjx_prints_nothing():
     code = "import kjax.sim.engines.mjx, kjax.sim.sensitivity; from mujoco import mjx; mjx.step"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_a_step_in_float32_says_nothing_where_mjx_itself_warns():
+    def single(tree):
+        return jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == float else a, tree)
+
+    model = mujoco.MjModel.from_xml_string(SENSES)
+    own = single(jax.tree.map(jnp.asarray, mjx.put_model(model)))
+    data = single(jax.tree.map(jnp.asarray, mjx.make_data(model)))
+    with pytest.warns(FutureWarning, match="scatter inputs"):
+        jax.eval_shape(mjx.step, own, data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.eval_shape(mjx_step, own, data)

@@ -28,7 +28,7 @@ from kjax.sim.engines.mjx import MjxEngine
 from kjax.sim.engines.mujoco import MujocoEngine, simulate
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.episode import Episode, initial_state
-from kjax.sim.mjx_import import mjx
+from kjax.sim.mjx_import import mjx, mjx_step
 from kjax.sim.observe import find_addresses
 from kjax.sim.resolve import batch_spec, resolve_episode, resolve_episodes
 
@@ -196,7 +196,7 @@ def mjx_batch(size: int, rounds: int) -> dict[str, float]:
     def rollout(data: Any, torque: Any) -> Any:
         def tick(data: Any, row: Any) -> Any:
             def step(data: Any, _: None) -> Any:
-                stepped = mjx.step(model, data.replace(ctrl=row))
+                stepped = mjx_step(model, data.replace(ctrl=row))
                 return jax.tree.map(lambda a, b: a.astype(b.dtype), stepped, data), None
 
             return jax.lax.scan(step, data, None, length=per_tick)[0], data.qpos

@@ -36,7 +36,7 @@ from kjax.sim.episode import (
     push_at,
     stack_params,
 )
-from kjax.sim.mjx_import import mjx
+from kjax.sim.mjx_import import mjx, mjx_step
 from kjax.sim.observe import find_addresses
 from kjax.sim.recording import Recording, recording_of_ticks
 from kjax.sim.scene import build_spec
@@ -270,7 +270,7 @@ class MjxEngine:
         def physics(data: Any, torque: Array, step: Array, alive: Array) -> Any:
             push = push_at(params, step, xp=jnp).astype(self.dtype)
             pushes = jnp.zeros_like(data.xfrc_applied).at[trunk, :3].set(push)
-            stepped = mjx.step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
+            stepped = mjx_step(model, data.replace(ctrl=torque, xfrc_applied=pushes))
             # A robot that has fallen stays as it is, whatever its state has become.
             return jax.tree.map(
                 lambda new, old: jnp.where(alive, new, old), _same_types(stepped, data), data
