@@ -64,9 +64,9 @@ def follow_path(
     along = speed * np.array([np.cos(point.heading), np.sin(point.heading)])
     v = along + gains[0] * (point.place - np.asarray(place, float))
     c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.arctan2(np.sin(point.heading - yaw), np.cos(point.heading - yaw))
+    heading_error = np.arctan2(np.sin(point.heading - yaw), np.cos(point.heading - yaw))
     return {
         "v_x": float(c * v[0] + s * v[1]),
         "v_y": float(-s * v[0] + c * v[1]),
-        "yaw_rate": float(speed * point.curvature + gains[1] * turn),
+        "yaw_rate": float(speed * point.curvature + gains[1] * heading_error),
     }

@@ -34,8 +34,8 @@ def _borders(one: gait.Gait, horizon: float) -> int:
     durations = one.durations(0) * (2 + ceil(horizon / sum(one.durations(0))))
     most = 1
     for first in range(len(one.phases)):
-        ends = accumulate(durations[first:], initial=0.0)
-        most = max(most, sum(end < horizon for end in ends))
+        borders = accumulate(durations[first:], initial=0.0)
+        most = max(most, sum(end < horizon for end in borders))
     return most
 
 
@@ -44,11 +44,9 @@ def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> 
     own = config.spatial
     mass, pitch_inertia = body_numbers(config, robot)
     inertia = robot.inertia * (pitch_inertia / robot.pitch_inertia)
-    numbers = array_library(mass, inertia)
+    xp = array_library(mass, inertia)
     return SpatialParams(
-        body=SpatialBody(
-            mass=numbers.asarray(mass, float), inertia=numbers.asarray(inertia, float)
-        ),
+        body=SpatialBody(mass=xp.asarray(mass, float), inertia=xp.asarray(inertia, float)),
         weights=momentum.Weights(
             attitude=_floats(own.attitude),
             position=_floats(own.position),

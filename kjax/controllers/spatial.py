@@ -232,17 +232,18 @@ def _targets(
     def about(angle: Array, axis: int) -> Array:
         return rotations.exp(jnp.stack([angle if i == axis else zero for i in range(3)], axis=-1))
 
-    turn = about(heading, 2)
+    R_yaw = about(heading, 2)
     ahead, left = (
         jnp.stack([jnp.cos(heading), jnp.sin(heading)]),
         jnp.stack([-jnp.sin(heading), jnp.cos(heading)]),
     )
     # Axes of a trunk that lies along a plane: nose along it, then the left side.
-    along = jnp.arctan(own.alignment * slope @ ahead)
-    lean = jnp.arctan(own.alignment * slope @ left * jnp.cos(along))
+    slope_pitch = jnp.arctan(own.alignment * slope @ ahead)
+    slope_roll = jnp.arctan(own.alignment * slope @ left * jnp.cos(slope_pitch))
     # Nose up is a turn about the axis to the right.
-    pitch, roll = theta + motion.command[PITCH] + along, motion.command[ROLL] + lean
-    R = turn @ about(-pitch, 1) @ about(roll, 0)
+    pitch = theta + motion.command[PITCH] + slope_pitch
+    roll = motion.command[ROLL] + slope_roll
+    R = R_yaw @ about(-pitch, 1) @ about(roll, 0)
     yaw_rate = zero + motion.velocity[2]
     # Along a plane the trunk turns about its normal.
     tilted = own.alignment * yaw_rate
@@ -258,7 +259,7 @@ def _targets(
     return momentum.Targets(
         R=R,
         p=jnp.concatenate([place, height[:, None]], axis=1),
-        omega=jnp.einsum("kij,kj->ki", turn, omega.T),
+        omega=jnp.einsum("kij,kj->ki", R_yaw, omega.T),
         v=jnp.concatenate([velocity, (v_z + rise(slope, velocity))[:, None]], axis=1),
         heading=jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1),
         force=jnp.stack([flat, flat, force_z], axis=-1),

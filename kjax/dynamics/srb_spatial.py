@@ -108,7 +108,7 @@ def step(
         """Angular velocity at a time within the step."""
         return angular_velocity(body, R, translation(body, state, contacts, t)[2])
 
-    def turn(R: Array, i: Array) -> tuple[Array, None]:
+    def substep(R: Array, i: Array) -> tuple[Array, None]:
         t = i * h
 
         def slope(w: Array, c: float) -> Array:
@@ -123,7 +123,7 @@ def step(
         k4 = slope(k3, 1.0)
         return rotations.exp((k1 + 2 * k2 + 2 * k3 + k4) / 6) @ R, None
 
-    R, _ = jax.lax.scan(turn, state.R, jnp.arange(substeps, dtype=state.p.dtype))
+    R, _ = jax.lax.scan(substep, state.R, jnp.arange(substeps, dtype=state.p.dtype))
     p, v, L = translation(body, state, contacts, dt)
     return BodyState(p=p, R=R, v=v, L=L)
 

@@ -5,9 +5,9 @@ forces in the world frame on feet that stay where they stand,
 
     p' = v,    v' = g + sum F_i / m,    H' = sum (r_i - o) x F_i + m (p - o) x g,
 
-so these ten numbers are a finite Koopman-invariant subspace: no product of state and input is left,
-whatever the attitude does, in every contact mode. Only the attitude itself stays outside. o is
-near the robot: about the world's origin, a kilometre away, H is thousands of N m s.
+so these ten observables are a finite Koopman-invariant subspace: no product of state and input is
+left, whatever the attitude does, in every contact mode. Only the attitude itself stays outside. o
+is near the robot: about the world's origin, a kilometre away, H is thousands of N m s.
 """
 
 from typing import NamedTuple

@@ -249,17 +249,17 @@ def _turning_foothold(
     assert body is not None  # _free_view made it
     wait, yaw_rate = footing.remaining, footing.velocity[2]
     assert footing.slope is not None  # the spatial controller's state has it
-    turn = yaw_rate * wait
-    angle = body.yaw + turn
+    ahead = yaw_rate * wait  # yaw until then
+    angle = body.yaw + ahead
     # The way turns with the trunk.
     now = spatial.rotate(body.heading, body.com_vel)[:2]
-    velocity = turned(turn, now)
+    velocity = turned(ahead, now)
     below = footing.ground + rise(footing.slope, (body.com - body.base)[:2])
     place = footholds(
         robot,
         settings.offset,
         Arrival(
-            place=body.com[None, :2] + wait[:, None] * turned(0.5 * turn, now),
+            place=body.com[None, :2] + wait[:, None] * turned(0.5 * ahead, now),
             velocity=velocity,
             error=velocity - turned(angle, footing.velocity[:2]),
             heading=jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1),

@@ -29,7 +29,7 @@ from kjax.mpc.grid import FootNodes, Grid
 # Of the pyramid in place of the friction cone. At a corner it allows 1 / cos(pi / SIDES) times the
 # cone's friction: 1.08, where that with four sides allows 1.41 and the feet slip on a diagonal.
 SIDES = 8
-STATE = 12  # numbers of this model's x, and of the errors that the cost weighs
+STATE = 12  # entries of this model's x, and of the errors that the cost weighs
 
 
 class Targets(NamedTuple):
@@ -115,7 +115,7 @@ class MomentumMemory(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Prediction about a nominal roll-out, by this model or another one, of n numbers x.
+    """Prediction about a nominal roll-out, by this model or another one, of n states x.
 
     Attributes:
       states: nominal ones (K + 1, ...), the first one now.
@@ -199,8 +199,8 @@ def _node(
     a = srb_spatial.gravity(h.dtype) + total / m
     mean = now.p + h / 2 * now.v + h**2 / 6 * a  # of the path over the node
     pull = h * skew(total)
-    turn = rotations.exp(h / 2 * srb_spatial.angular_velocity(body, now.R, now.L)) @ now.R
-    W = turn @ rotations.inverse(body.inertia) @ turn.T
+    R_mid = rotations.exp(h / 2 * srb_spatial.angular_velocity(body, now.R, now.L)) @ now.R
+    W = R_mid @ rotations.inverse(body.inertia) @ R_mid.T
     half = h / 2 * W @ skew((now.L + then.L) / 2)
     back = rotations.inverse(eye - half)
     by_L = h / 2 * back @ W  # of d by the sum of Lam before and after
@@ -274,8 +274,8 @@ def errors(
         C = jnp.einsum("ij,gjn->gin", to_heading, rows).reshape(STATE, -1)
         return (error @ to_heading.T).reshape(-1), C
 
-    ends = jax.tree.map(lambda a: a[1:], response.states)
-    return jax.vmap(one)(ends, response.omega, response.outputs, targets)
+    then = jax.tree.map(lambda a: a[1:], response.states)
+    return jax.vmap(one)(then, response.omega, response.outputs, targets)
 
 
 def foot_rows(

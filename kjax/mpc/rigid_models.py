@@ -97,10 +97,10 @@ def present(
         R = rotations.exp(d) @ start.R
         inertia = R @ body.inertia @ R.T
         moment = jnp.cross(feet - p[None], force).sum(axis=0) - jnp.cross(w, inertia @ w)
-        turn = w - jnp.cross(d, w) / 2 + jnp.cross(d, jnp.cross(d, w)) / 12
+        d_rate = w - jnp.cross(d, w) / 2 + jnp.cross(d, jnp.cross(d, w)) / 12
         rate = R @ rotations.inverse(body.inertia) @ R.T @ moment
         fall = srb_spatial.gravity(p.dtype) + force.sum(axis=0) / body.mass
-        return jnp.concatenate([turn, v, rate, fall])
+        return jnp.concatenate([d_rate, v, rate, fall])
 
     y0 = jnp.concatenate([jnp.zeros_like(start.p), start.p, omega, start.v])
     Ac = jax.jacfwd(slope)(y0, nominal[0], feet[0])

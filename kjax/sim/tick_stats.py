@@ -81,7 +81,7 @@ def of_steps(
 ) -> TickStats:
     """Each step on its own.
 
-    Seven arguments: the six series that the numbers are of, and the library that computes them.
+    Seven arguments: the six series that the statistics are of, and the library that computes them.
 
     Args:
       x: (n, 6) SRB states.
@@ -206,7 +206,7 @@ def build_read_window(
 
 
 def _of_tick(steps: TickStats) -> TickStats:
-    """One tick's numbers from those of its steps, zeros where one is not finite."""
+    """One tick's statistics from those of its steps, zeros where one is not finite."""
     finite = jnp.stack([jnp.isfinite(a).all() for a in steps]).all()
     tick = TickStats(
         **{

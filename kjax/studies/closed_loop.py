@@ -1,4 +1,4 @@
-"""Walk under the Koopman LMPC in MuJoCo: one run, or one per seed.
+"""Closed loop under the Koopman LMPC in MuJoCo: one run, or one per seed.
 
 Leaves metrics.json, config.toml, trajectory.npz, figure.png and, if asked for, video.mp4 in the
 output folder. Ctrl-C stops the run and writes what was simulated, but no metrics of it, which would

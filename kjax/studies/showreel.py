@@ -63,7 +63,7 @@ class ShowreelOptions(Options):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Walk, render, assemble."""
+    """Record, render, assemble."""
     args = parse(ShowreelOptions, argv, __doc__.splitlines()[0])
     cli.configure_jax(one_core=True)
     folder = cli.output_folder(args, "showreel")

@@ -42,11 +42,11 @@ def test_a_verb_gets_the_words_after_it_and_its_exit_code_is_kept(call, monkeypa
 def test_a_study_of_ones_own_is_found_by_its_name(call, monkeypatch):
     seen = []
 
-    def own(words):
+    def study(words):
         seen.append((called(), list(words)))
         return 5
 
-    monkeypatch.setitem(sys.modules, "mine", SimpleNamespace(main=own))
+    monkeypatch.setitem(sys.modules, "mine", SimpleNamespace(main=study))
     assert call(kjax, "study", "mine:main", "--seeds", "3") == 5
     assert seen == [("kjax study mine:main", ["--seeds", "3"])]
 

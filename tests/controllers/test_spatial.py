@@ -129,8 +129,8 @@ def test_the_derivative_of_a_plan_is_that_of_differences(spatial, tables):
     state, _ = spatial.plan(tables, state, seen)
 
     def pressed(v):
-        moved = seen._replace(base_vel=seen.base_vel + v)
-        return (spatial.plan(tables, state, moved)[0].force * jnp.arange(12.0).reshape(4, 3)).sum()
+        faster = seen._replace(base_vel=seen.base_vel + v)
+        return (spatial.plan(tables, state, faster)[0].force * jnp.arange(12.0).reshape(4, 3)).sum()
 
     got = jax.jit(jax.grad(pressed))(jnp.zeros(3))
     for axis, step in enumerate(1e-5 * np.eye(3)):

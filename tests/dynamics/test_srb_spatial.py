@@ -40,13 +40,13 @@ def integrated(state, contacts, t):
         p, v, quat, w = y[:3], y[3:6], y[6:10], y[10:]
         R = Rotation.from_quat(quat / np.linalg.norm(quat)).as_matrix()
         moment = R.T @ np.cross(feet - p, force).sum(0)
-        turn = np.linalg.solve(INERTIA, moment - np.cross(w, INERTIA @ w))
+        w_rate = np.linalg.solve(INERTIA, moment - np.cross(w, INERTIA @ w))
         x, y_, z, s = quat
         dq = 0.5 * np.array(
             [s * w[0] + y_ * w[2] - z * w[1], s * w[1] + z * w[0] - x * w[2],
              s * w[2] + x * w[1] - y_ * w[0], -x * w[0] - y_ * w[1] - z * w[2]]
         )  # fmt: skip
-        return np.concatenate([v, G + force.sum(0) / 12.743, dq, turn])
+        return np.concatenate([v, G + force.sum(0) / 12.743, dq, w_rate])
 
     w = np.linalg.solve(INERTIA, state.R.T @ state.L)
     start = np.concatenate([state.p, state.v, Rotation.from_matrix(state.R).as_quat(), w])

@@ -34,8 +34,8 @@ def _grid(clock):
 
 
 @jax.jit
-def _body(turn, omega, v):
-    R = rotations.exp(turn)
+def _body(rotation, omega, v):
+    R = rotations.exp(rotation)
     return BodyState(jnp.array([0.0, 0.0, 0.27]), R, v, srb_spatial.momentum(BODY, R, omega))
 
 
@@ -50,8 +50,8 @@ def problem(seed=0, which=0):
     """A tilted, turning body, its grid, feet and forces that share the weight."""
     rng = np.random.default_rng(seed)
     found = nodes(which)
-    turn, omega, v = (rng.uniform(-most, most, 3) for most in (0.2, 1.0, 0.4))
-    start = jax.tree.map(np.asarray, _body(turn, omega, v))
+    rotation, omega, v = (rng.uniform(-most, most, 3) for most in (0.2, 1.0, 0.4))
+    start = jax.tree.map(np.asarray, _body(rotation, omega, v))
     feet = np.tile(HIPS + rng.uniform(-0.03, 0.03, (4, 3)), (len(found.length), 1, 1))
     count = np.maximum(found.stance.sum(1), 1)[:, None, None]
     share = found.stance[..., None] * np.array([0.0, 0.0, WEIGHT]) / count

@@ -20,11 +20,11 @@ log = jax.jit(rotations.log)
 
 def test_nodes_end_where_phases_do():
     found = nodes(elapsed=0.05)
-    ends = found.end
+    node_end = found.end
     used = found.length > 0
     assert used.sum() == 10
     np.testing.assert_allclose(found.length[:6], 0.025)  # 0.15 s of the present phase
-    np.testing.assert_allclose(ends[[5, 9]], [0.15, 0.25])
+    np.testing.assert_allclose(node_end[[5, 9]], [0.15, 0.25])
     assert found.stance[:6, 0].all()
     assert found.stance[6:10, 1].all()
     assert not found.stance[10:].any()
@@ -53,16 +53,18 @@ def test_place_and_momentum_about_the_path_are_exact_for_any_change_of_the_force
     rng = np.random.default_rng(2)
     change = 40.0 * rng.normal(size=nominal.shape) * found.stance[..., None]
     response = jax.tree.map(np.asarray, linearise(BODY, start, found.length, feet, nominal))
-    moved = rollout(BODY, start, Contacts(feet, nominal + change), found.length)
-    moved = jax.tree.map(np.asarray, moved)
+    changed = rollout(BODY, start, Contacts(feet, nominal + change), found.length)
+    changed = jax.tree.map(np.asarray, changed)
     x = np.zeros(12)
     for k, (A, B) in enumerate(zip(response.A, response.B, strict=True)):
         x = A @ x + np.einsum("lsf,lf->s", B, change[k])
         dp, dv = (
             a[k + 1] - b[k + 1]
-            for a, b in zip((moved.p, moved.v), (response.states.p, response.states.v), strict=True)
+            for a, b in zip(
+                (changed.p, changed.v), (response.states.p, response.states.v), strict=True
+            )
         )
-        lam = moved.L[k + 1] + 12.743 * np.cross(dp, dv)
+        lam = changed.L[k + 1] + 12.743 * np.cross(dp, dv)
         np.testing.assert_allclose(x[3:6], dp, atol=1e-13)
         np.testing.assert_allclose(x[9:], dv, atol=1e-13)
         np.testing.assert_allclose(x[6:9], lam - response.states.L[k + 1], atol=1e-11)
@@ -78,11 +80,11 @@ def test_the_attitude_is_first_order_in_the_change_of_the_forces():
     def missed(size):
         response = linearise(BODY, start, length, feet, nominal)
         change = size * direction
-        moved = rollout(BODY, start, Contacts(feet, nominal + change), length)
+        changed = rollout(BODY, start, Contacts(feet, nominal + change), length)
         x = np.zeros(12)
         for A, B, u in zip(np.asarray(response.A), np.asarray(response.B), change, strict=True):
             x = A @ x + np.einsum("lsf,lf->s", B, u)
-        d = np.asarray(log(np.asarray(moved.R)[-1] @ np.asarray(response.states.R)[-1].T))
+        d = np.asarray(log(np.asarray(changed.R)[-1] @ np.asarray(response.states.R)[-1].T))
         return np.linalg.norm(d - x[:3]), np.linalg.norm(d)
 
     (large, turned), (small, _) = missed(40.0), missed(10.0)

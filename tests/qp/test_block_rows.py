@@ -79,9 +79,9 @@ def test_its_derivative_agrees_with_finite_differences(tight):
                            (0.0,), (1.0,))  # fmt: skip
     h = 1e-5
     for name in ("x", "multipliers"):
-        ends = [np.asarray(getattr(moved(t), name)) for t in (-h, h)]
+        below, above = [np.asarray(getattr(moved(t), name)) for t in (-h, h)]
         np.testing.assert_allclose(
-            getattr(slope, name), (ends[1] - ends[0]) / (2 * h), rtol=1e-4, atol=1e-5
+            getattr(slope, name), (above - below) / (2 * h), rtol=1e-4, atol=1e-5
         )
     assert np.abs(slope.x).max() > 1e-3
     assert point.primal <= 1e-9

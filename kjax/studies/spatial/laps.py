@@ -44,7 +44,7 @@ def configs(args: SpatialOptions) -> list[RunConfig]:
 
 
 def lapped(config: RunConfig) -> Row:
-    """Walk one: C MuJoCo at 1 kHz, sensor noise on all that the robot and the path's loop see."""
+    """One episode in C MuJoCo at 1 kHz, sensor noise on all that robot and path's loop see."""
     episode = resolve_episode(config)
     engine = MujocoEngine(episode.spec)
     model, at = engine.model, engine.addresses

@@ -179,13 +179,13 @@ def _speeds_table(rows: list[Row]) -> str:
             row for row in rows
             if row["gait"] == name and row["asked"] > (best["asked"] if best else 0.0)
         ]  # fmt: skip
-        after = later[0]["held"] if later else None
+        beyond = later[0]["held"] if later else None
         lines.append((
             name.replace("_", " "), f"{best['asked']:g} {unit}" if best else "none",
             number(best["reached"], 2) if best else "",
             number(best["roll_max_deg"], 1) if best else "",
             number(best["pitch_max_deg"], 1) if best else "",
-            f"{after['count']} of {after['episodes']}" if after else "end of the search",
+            f"{beyond['count']} of {beyond['episodes']}" if beyond else "end of the search",
         ))  # fmt: skip
     return markdown_table(header, lines)
 
@@ -218,8 +218,8 @@ def _switches_summary(args: SpatialOptions, done: Done) -> Row:
         if run["peaks_deg"] is None or any(one["peaks_deg"] is None for one in others):
             continue
         # The gaits on both sides, each alone.
-        usual = np.maximum(*(np.array(one["peaks_deg"]) for one in others))
-        above.append((np.array(run["peaks_deg"]) - usual).max())
+        alone = np.maximum(*(np.array(one["peaks_deg"]) for one in others))
+        above.append((np.array(run["peaks_deg"]) - alone).max())
     return {
         "falls": share(sum(run["fell"] for run in there), len(there)),
         "above_median_deg": float(np.median(above)) if above else None,

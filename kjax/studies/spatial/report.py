@@ -57,8 +57,8 @@ def _draw_grounds(
         value += gap * (place - 0.5 * (len(kin) - 1))
         shares = [row["crossed"] for row in own]
         middle = 100 * np.array([one["count"] / one["episodes"] for one in shares])
-        ends = 100 * np.array([one["interval"] for one in shares]).T
-        ax.errorbar(value, middle, np.abs(ends - middle), color=colour, marker="o", capsize=3,
+        interval = 100 * np.array([one["interval"] for one in shares]).T
+        ax.errorbar(value, middle, np.abs(interval - middle), color=colour, marker="o", capsize=3,
                     label=ground.title)  # fmt: skip
     ax.set(xlabel=label, ylim=(-5, 105), xticks=scale * np.array(ticks))
     ax.legend(loc="lower left")

@@ -264,13 +264,13 @@ def _lifted(drawn: Data, k: int) -> Float[Array, "N 28"]:
 @partial(jax.jit, static_argnames=("name", "legs"))
 def _edmd(data: Data, steps: Data, name: str, legs: tuple[int, ...]) -> Float[Array, "N K 28"]:
     """Fit increments of one step, and roll the lifted states out."""
-    z, after = _lifted(steps, 0), _lifted(steps, 1)
+    z, z_next = _lifted(steps, 0), _lifted(steps, 1)
 
     def regressors(z: Array, feet: Array, force: Array, path: Array) -> Array:
         return REGRESSORS[name](z, legs, feet, force, path)
 
     Z = jax.vmap(regressors)(z, steps.feet, steps.force[:, 0], steps.states.p[:, 0])
-    W = regression.solve(regression.of_rows(Z, after - z), Z.shape[1]).W
+    W = regression.solve(regression.of_rows(Z, z_next - z), Z.shape[1]).W
     K = data.force.shape[1]
 
     def roll(z: Array, feet: Array, force: Array, p: Array, v: Array) -> Array:
