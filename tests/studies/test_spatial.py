@@ -123,12 +123,13 @@ def test_the_strongest_push_is_that_of_the_weakest_phase_with_all_weaker_ones():
     np.testing.assert_array_equal(each, [20.0, 20.0, 10.0, 20.0, 20.0, 20.0, 20.0, 20.0])
 
 
-def test_the_fastest_is_below_the_first_speed_that_a_seed_does_not_hold():
+def test_the_fastest_is_held_by_every_seed_and_no_slower_one_saw_a_fall():
     rows = [
-        {"gait": "trot", "asked": speed, "held": {"count": count, "episodes": 4}}
-        for speed, count in ((1.2, 4), (1.6, 4), (1.4, 3))
+        {"gait": "trot", "asked": speed, "held": {"count": count, "episodes": 4}, "falls": falls}
+        for speed, count, falls in ((1.2, 4, 0), (1.4, 3, 0), (1.6, 4, 0), (1.8, 3, 1), (2.0, 4, 0))
     ]
-    assert limits.fastest(rows, "trot")["asked"] == 1.2
+    assert limits.fastest(rows, "trot")["asked"] == 1.6
+    assert limits.fastest(rows[-2:], "trot") is None
     assert limits.fastest(rows, "bound") is None
 
 

@@ -160,12 +160,13 @@ def _speeds_summary(args: SpatialOptions, done: Done) -> list[Row]:
 
 
 def fastest(rows: list[Row], name: str) -> Row | None:
-    """The fastest that every seed holds, with all slower ones; ``None`` if none is."""
+    """The fastest that every seed holds where none fell at a slower one; ``None`` if none is."""
     best = None
     for row in sorted((one for one in rows if one["gait"] == name), key=lambda one: one["asked"]):
-        if row["held"]["count"] < row["held"]["episodes"]:
+        if row["falls"]:
             break
-        best = row
+        if row["held"]["count"] == row["held"]["episodes"]:
+            best = row
     return best
 
 
