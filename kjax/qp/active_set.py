@@ -78,7 +78,7 @@ class ActiveSet(NamedTuple):
         return -self.bound_status * self.spread(self.y)
 
     def spread(self, slots: Float[Array, "n"]) -> Float[Array, "M"]:
-        """Numbers (M,) of the rows, 0 where not active, from those of the slots."""
+        """Values (M,) of the rows, 0 where not active, from those of the slots."""
         return jnp.zeros_like(self.value).at[self.slot_row].add(slots, mode="drop")
 
 

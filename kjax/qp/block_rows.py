@@ -87,8 +87,14 @@ def solve_block_rows(
     Returns:
       A ``RowSolution``, as ``solve_rows`` gives with the whole matrix and ``"active_set"``; its
       multipliers are those of the blocks' rows, then those of the box.
+
+    Raises:
+      ValueError: for blocks of another number of variables, or settings that make no sense.
     """
-    settings = RowSettings("active_set", tolerance, max_iterations).reachable(q.dtype)
+    F, _, b = rows.matrix.shape
+    if F * b != q.shape[0]:
+        raise ValueError(f"rows: wanted blocks of all {q.shape[0]} variables, got {F} of {b}")
+    settings = RowSettings("active_set", tolerance, max_iterations).checked()
     return _differentiable(settings, _Qp(H, q, rows, lower, upper))
 
 
@@ -114,6 +120,7 @@ def _with_rows(settings: RowSettings, old: RowSolution, qp: _Qp) -> RowSolution:
 
 def _without_rows(settings: RowSettings, qp: _Qp) -> tuple[RowSolution, Bool[Array, ""]]:
     """Steps 1 and 2: the point, and whether it is the solution."""
+    settings = settings.reachable(qp.q.dtype)
     H, q, rows, lower, upper = qp
     n, (F, r, b) = q.shape[0], rows.matrix.shape
     H = 0.5 * (H + H.T)

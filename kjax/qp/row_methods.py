@@ -54,6 +54,14 @@ class RowSettings(NamedTuple):
     tolerance: float
     max_iterations: int
 
+    def checked(self) -> "RowSettings":
+        """These, if they make sense."""
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations must be at least 1, got {self.max_iterations}")
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance must be above 0, got {self.tolerance}")
+        return self
+
     def reachable(self, dtype: Any) -> "RowSettings":
         """These with a tolerance that the type's rounding allows."""
         return self._replace(tolerance=max(self.tolerance, 20.0 * float(jnp.finfo(dtype).eps)))

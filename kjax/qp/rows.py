@@ -122,11 +122,7 @@ def solve_rows(
         raise ValueError(f"method must be one of {sorted(ROW_METHODS)}, got {method!r}")
     if max_iterations is None:
         max_iterations = 4000 if method == "admm" else 100
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations must be at least 1, got {max_iterations}")
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be above 0, got {tolerance}")
-    settings = RowSettings(method, tolerance, max_iterations)
+    settings = RowSettings(method, tolerance, max_iterations).checked()
     warm = None if warm is None else jax.lax.stop_gradient(warm)
     return _differentiable(settings, warm, _Qp(H, q, C, row_lower, row_upper, lower, upper))
 

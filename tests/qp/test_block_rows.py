@@ -138,3 +138,14 @@ def test_in_float32_it_is_as_good_as_float32_lets_it_be():
     assert solution.x.dtype == jnp.float32
     assert solution.status == Status.SOLVED
     np.testing.assert_allclose(solution.x, x, atol=1e-3)
+
+
+def test_what_makes_no_sense_is_refused():
+    H, q, rows, lower, upper = problem(0, tight=0.003)
+    short = BlockRows(*(a[1:] for a in rows))
+    with pytest.raises(ValueError, match="rows: wanted blocks of all 12 variables, got 3 of 3"):
+        solve(H, q, short, lower, upper)
+    with pytest.raises(ValueError, match="tolerance must be above 0"):
+        solve(H, q, rows, lower, upper, tolerance=0.0)
+    with pytest.raises(ValueError, match="max_iterations must be at least 1"):
+        solve(H, q, rows, lower, upper, max_iterations=0)
