@@ -290,5 +290,5 @@ class LateralConfig:
     """Weight of a squared change of the planned foot forces beside them [-]."""
     friction: NonNegative = 0.6
     """Horizontal over vertical force of a foot, at most; the LMPC's own where that is less [-]."""
-    foothold_gain: Annotated[NonNegative, DURATION] = 0.24
+    foothold_gain: Annotated[NonNegative, GAIN, DURATION] = 0.24
     """Sideways foothold per sideways velocity, beyond Raibert's law [sqrt(L/g)]."""

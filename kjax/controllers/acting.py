@@ -89,7 +89,7 @@ def build_act(base: Base, act_dt: float) -> Act:
         valid = sample.valid
         base_vel = jnp.where(valid, view.base_vel, state.base_vel)
         motion = act_dt * base_vel
-        ground, slope = _ground_after(state, motion)
+        ground, slope = ground_after(state, motion)
         next_state = state._replace(
             swing=swing.carry_along(feet.swings, motion),
             ground=ground,
@@ -105,7 +105,7 @@ def build_act(base: Base, act_dt: float) -> Act:
     return act
 
 
-def _velocity_wanted(state: ControllerState) -> Float[Array, "3"]:
+def velocity_wanted(state: ControllerState) -> Float[Array, "3"]:
     """References of v_x, v_y and yaw rate, integral action included."""
     corrected = 1 if state.slope is None else 2  # the planar controller's second one is of pitch
     return state.velocity.at[:corrected].add(state.correction[:corrected])
@@ -118,7 +118,7 @@ def _ground_at(state: ControllerState, feet: Float[Array, "4 d"]) -> Array:
     return state.ground + rise(state.slope.slope, feet[:, :2])
 
 
-def _ground_after(state: ControllerState, motion: Float[Array, "d"]) -> tuple[Array, Any]:
+def ground_after(state: ControllerState, motion: Float[Array, "d"]) -> tuple[Array, Any]:
     """Height and slope of the ground below an origin that has moved on."""
     height = state.ground - motion[-1]
     if state.slope is None:
@@ -158,7 +158,7 @@ def _foot_targets(
     footing = Footing(
         remaining=jnp.maximum(swings.duration - swings.elapsed, 0.0),
         stance_time=params.schedule.stance_time[state.clock.gait, state.clock.phase],
-        velocity=_velocity_wanted(state),
+        velocity=velocity_wanted(state),
         ground=state.ground,
         slope=None if state.slope is None else state.slope.slope,
     )

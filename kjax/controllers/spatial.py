@@ -166,8 +166,10 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
             residual=jnp.where(valid, solved.residual, jnp.inf),
             iterations=solved.iterations,
             mode=params.schedule.mode[clock.gait, clock.phase],
-            x=jnp.concatenate([_angles(start.R), start.p, omega, velocity]),
-            reference=jnp.concatenate([_angles(first.R), first.p, first.omega, first.v]),
+            x=jnp.concatenate([rotations.trunk_angles(start.R), start.p, omega, velocity]),
+            reference=jnp.concatenate(
+                [rotations.trunk_angles(first.R), first.p, first.omega, first.v]
+            ),
             contact_fault=contact.is_faulty(state.contact),
             command_ignored=jnp.zeros((), bool),
             blind_time=jnp.where(valid, 0.0, state.blind_time + spec.act_dt),
@@ -325,18 +327,6 @@ def _torque_maps(
         return -jnp.einsum("lij,wi->ljw", spatial.foot_jacobian(robot, hip, trig), R)
 
     return jax.vmap(one)(states.R[:-1], states.p[:-1], contacts)
-
-
-def _angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Roll, pitch (nose up) and yaw [rad]."""
-    level = jnp.sqrt(R[0, 0] ** 2 + R[1, 0] ** 2)
-    return jnp.stack(
-        [
-            jnp.arctan2(R[2, 1], R[2, 2]),
-            jnp.arctan2(R[2, 0], level),
-            jnp.arctan2(R[1, 0], R[0, 0]),
-        ]
-    )
 
 
 def _wrapped(angle: Float[Array, ""]) -> Float[Array, ""]:

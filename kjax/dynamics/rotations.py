@@ -56,3 +56,15 @@ def log(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
     series = 1 + square / 6 + 3 * square**2 / 40 + 5 * square**3 / 112
     tiny = jnp.finfo(R.dtype).tiny
     return 0.5 * jnp.where(small, series, angle / jnp.maximum(sine, tiny))[..., None] * v
+
+
+def trunk_angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Roll (right side down), pitch (nose up) and yaw (to the left) of a trunk [rad]."""
+    level = jnp.sqrt(R[0, 0] ** 2 + R[1, 0] ** 2)
+    return jnp.stack(
+        [
+            jnp.arctan2(R[2, 1], R[2, 2]),
+            jnp.arctan2(R[2, 0], level),
+            jnp.arctan2(R[1, 0], R[0, 0]),
+        ]
+    )

@@ -64,6 +64,22 @@ class SpatialState(NamedTuple):
     feet: Float[Array, "4 3"]
 
 
+class Trunk(NamedTuple):
+    """How a free trunk lies and moves, track frame.
+
+    Attributes:
+      rotation: (3, 3) R_track_body.
+      base: (3,) origin [m].
+      base_vel: (3,) its velocity [m/s].
+      omega: (3,) angular velocity [rad/s].
+    """
+
+    rotation: Float[Array, "3 3"]
+    base: Float[Array, "3"]
+    base_vel: Float[Array, "3"]
+    omega: Float[Array, "3"]
+
+
 def hip_trig(joint_pos: Float[Array, "4 3"]) -> HipTrig:
     """Trigonometry of the abduction joints, from joint angles (4, 3) [rad]."""
     trig = HipTrig(s0=jnp.sin(joint_pos[:, 0]), c0=jnp.cos(joint_pos[:, 0]))
@@ -166,7 +182,6 @@ def spatial_state(
     rotation = rotate_back(track, rotation_matrix(observation.base_quat).T).T
     base = rotate_back(track, observation.base_pos)
     base_vel = rotate_back(track, observation.base_vel)
-    forward = _heading(rotation)
     omega = rotation @ observation.base_ang_vel
 
     trig = kinematics.leg_trig(observation.joint_pos)
@@ -178,6 +193,29 @@ def spatial_state(
     local = foot_position(robot, hip, trig) + robot.hip_pos
     feet = base + local @ rotation.T
 
+    return seen_from_trunk(Trunk(rotation, base, base_vel, omega), com, com_vel, hip, trig, feet)
+
+
+def seen_from_trunk(
+    trunk: Trunk,
+    com: Float[Array, "3"],
+    com_vel: Float[Array, "3"],
+    hip: HipTrig,
+    trig: LegTrig,
+    feet: Float[Array, "4 3"],
+) -> SpatialState:
+    """The free robot of which everything is known in the track frame, as the controller sees it.
+
+    Args:
+      trunk: how it lies and moves.
+      com: (3,) whole-body centre of mass [m].
+      com_vel: (3,) its velocity [m/s].
+      hip: trigonometry of the abduction joints.
+      trig: of the other joints.
+      feet: (4, 3) foot centres [m].
+    """
+    rotation, base, base_vel, omega = trunk
+    forward = _heading(rotation)
     omega, com_vel = rotate_back(forward, omega), rotate_back(forward, com_vel)
     # The nose's horizontal part is never below zero: a pitch of -90 to 90 degrees.
     level = jnp.sqrt(rotation[0, 0] ** 2 + rotation[1, 0] ** 2)

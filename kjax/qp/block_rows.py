@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from kjax.precision import full_precision
@@ -22,6 +23,8 @@ from kjax.qp.problem import Status
 from kjax.qp.row_methods import MethodUsed, RowSettings
 from kjax.qp.row_problem import RowData, RowTerms, kkt_errors, largest_violation, variable_units
 from kjax.qp.rows import RowSolution, derivative, solve_data
+
+SOLUTION = "qp_solution"  # name of a solution that is differentiated
 
 
 class BlockRows(NamedTuple):
@@ -108,7 +111,8 @@ def _differentiable(settings: RowSettings, qp: _Qp) -> RowSolution:
 @full_precision
 def _derivative(settings: RowSettings, primals: Any, tangents: Any) -> tuple[Any, Any]:
     (qp,), (d_qp,) = primals, tangents
-    solution = _differentiable(settings, qp)
+    # Who recomputes a loop backward (``jax.checkpoint``) may keep this instead of solving again.
+    solution = checkpoint_name(_differentiable(settings, qp), SOLUTION)
     return solution, derivative(solution, qp.stacked(), d_qp.stacked())
 
 

@@ -66,6 +66,11 @@ def attitude(qpos: np.ndarray) -> tuple[Any, Any, Any]:
     return roll, pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])
 
 
+def angular_velocity(qpos: np.ndarray, qvel: np.ndarray) -> Any:
+    """Angular velocity (N, 3) of a free trunk, world [rad/s]."""
+    return Rotation.from_quat(qpos[:, [4, 5, 6, 3]]).apply(qvel[:, 3:6])
+
+
 def metrics(
     qpos: np.ndarray, qvel: np.ndarray, wanted: np.ndarray, steady: np.ndarray
 ) -> dict[str, float]:
@@ -87,8 +92,7 @@ def metrics(
     way = qpos[:, :2] - qpos[0, :2]
     drift = np.cos(yaw[0]) * way[:, 1] - np.sin(yaw[0]) * way[:, 0]
     v_y = np.cos(yaw) * qvel[:, 1] - np.sin(yaw) * qvel[:, 0]
-    quat = qpos[:, [4, 5, 6, 3]]
-    rate = Rotation.from_quat(quat).apply(qvel[:, 3:6])[:, 2]  # about the vertical
+    rate = angular_velocity(qpos, qvel)[:, 2]  # about the vertical
     missed = np.stack([v_y, rate], axis=-1)[steady] - wanted[steady]
     rmse = np.sqrt(np.mean(missed**2, axis=0))
     return {

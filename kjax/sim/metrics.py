@@ -28,7 +28,7 @@ def reference_height(
       time: (N,) since the start [s].
       goal: of the episode.
     """
-    return goal.heights[gait] + _asked(time, goal, "height")[:, 0]
+    return goal.heights[gait] + asked(time, goal, "height")[:, 0]
 
 
 def reference_velocity(time: Float[np.ndarray, "N"], goal: Goal) -> Float[np.ndarray, "N 3"]:
@@ -58,7 +58,7 @@ def reference_velocity(time: Float[np.ndarray, "N"], goal: Goal) -> Float[np.nda
     return out
 
 
-def _asked(time: Float[np.ndarray, "N"], goal: Goal, *names: str) -> Float[np.ndarray, "N k"]:
+def asked(time: Float[np.ndarray, "N"], goal: Goal, *names: str) -> Float[np.ndarray, "N k"]:
     """Columns of the command at some times."""
     piece = np.searchsorted(goal.command.times, time + 1e-9, side="right") - 1
     columns = [COMMAND_NAMES.index(name) for name in names]
@@ -109,7 +109,7 @@ def metrics(run: Trajectory, goal: Goal, stats: TickStats | None = None) -> dict
         **_tracking(run, goal, stats, known),
         **_crossing(run, goal),
         **_switching(run, goal),
-        **free_base.metrics(run.qpos, run.qvel, _asked(run.time, goal, "v_y", "yaw_rate"), steady),
+        **free_base.metrics(run.qpos, run.qvel, asked(run.time, goal, "v_y", "yaw_rate"), steady),
         **free_base.path_errors(run.qpos, reference_velocity(run.time, goal), run.dt),
         "foot_slip_m": float(stats.slip.sum() / _stances(run)),
         "torque_max_nm": float(stats.torque.max()),

@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from kjax.config import RunConfig
-from kjax.tuning.loop import CostWeights, Scenario, build_loop, cost
+from kjax.tuning.contract import CostWeights, Scenario
+from kjax.tuning.loop import build_loop, cost, plant_of
 from kjax.tuning.space import Space, Variables
 
 Objective = Callable[[Variables, Scenario], Float[Array, ""]]
@@ -67,11 +68,11 @@ def build_objective(
       weights: of the cost.
       memory: of the derivatives, see ``loop.build_loop`` [s].
     """
-    loop = build_loop(config, memory=memory)
+    loop, plant = build_loop(config, memory=memory), plant_of(config)
 
     def objective(variables: Variables, scenario: Scenario) -> Array:
         params = space.params(variables)
-        return cost(params.robot, loop(params, scenario), weights)
+        return cost(params.robot, loop(params, scenario), weights, plant)
 
     return objective
 

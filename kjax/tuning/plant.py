@@ -146,7 +146,14 @@ def follow(
     plant: PlantParams, before: Float[Array, "4 2"], planned: Float[Array, "4 2"], dt: float
 ) -> tuple[Float[Array, "4 2"], Float[Array, "4 2"]]:
     """Mean force of the next ``dt`` [s], and that at its end, from ``before`` to ``planned``."""
-    ticks = dt / jnp.maximum(plant.lag, 1e-3 * dt)
+    return lagged(plant.lag, before, planned, dt)
+
+
+def lagged(
+    lag: Float[Array, ""], before: Float[Array, "4 d"], planned: Float[Array, "4 d"], dt: float
+) -> tuple[Float[Array, "4 d"], Float[Array, "4 d"]]:
+    """``follow`` with a time constant ``lag`` [s]."""
+    ticks = dt / jnp.maximum(lag, 1e-3 * dt)
     left = jnp.exp(-ticks)
     gap = before - planned
     return planned + gap * (1.0 - left) / ticks, planned + gap * left

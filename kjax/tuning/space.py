@@ -67,7 +67,7 @@ def build_space(
       config: that all other parameters come from.
       keys: of ``TUNABLE``.
       robot: whose controller it is; that of the config if ``None``.
-      fits: models; those of the config if ``None``.
+      fits: models of a planar controller; those of the config if ``None``.
 
     Raises:
       ValueError: for a key that is no variable, or one whose number has no logarithm.
@@ -77,7 +77,7 @@ def build_space(
     _check_keys(config, keys, kinds)
     mass, inertia = (float(number) for number in body_numbers(config, robot))
     config = replace(config, srb=replace(config.srb, mass=mass, inertia=inertia))
-    if fits is None:
+    if fits is None and config.controller == "planar":
         with jax.enable_x64(True):
             fits = fit_models(config, robot)
     dtype = jnp.zeros(()).dtype
@@ -115,7 +115,7 @@ def _check_keys(config: RunConfig, keys: Sequence[str], kinds: Mapping[str, Tuna
     if not keys:
         raise ValueError("keys must name at least one variable, got none")
     with koopman_keys():
-        is_body = get_kind(config.koopman.model).is_body
+        is_body = config.controller == "spatial" or get_kind(config.koopman.model).is_body
     for key in keys:
         if key not in kinds:
             raise ValueError(f"keys: '{key}' is no variable; there are {', '.join(shown(kinds))}")
@@ -139,9 +139,11 @@ def _value_of(config: RunConfig, key: str, kind: Tunable) -> np.ndarray:
     return number
 
 
-def _with_body(fits: Fits, values_by_key: Mapping[str, Array]) -> Fits:
+def _with_body(fits: Fits | None, values_by_key: Mapping[str, Array]) -> Fits | None:
     """The fits with the tuned mass and inertia, where the model is the rigid body itself."""
-    if fits.prediction is None or not isinstance(fits.prediction.params, BodyModel):
+    if fits is None or fits.prediction is None:
+        return fits
+    if not isinstance(fits.prediction.params, BodyModel):
         return fits
     body = fits.prediction.params.body
     body = body._replace(

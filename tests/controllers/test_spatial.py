@@ -123,17 +123,24 @@ def test_a_batch_equals_single_robots(spatial, tables):
     np.testing.assert_allclose(batch.force, np.stack(plans), atol=1e-6)
 
 
-def test_the_derivative_of_a_plan_is_that_of_differences(spatial, tables):
+def test_the_derivatives_of_a_plan_by_state_and_weights_are_those_of_differences(spatial, tables):
     seen = disturbed(4)
     state = spatial.init(tables, seen)
     state, _ = spatial.plan(tables, state, seen)
 
-    def pressed(v):
-        faster = seen._replace(base_vel=seen.base_vel + v)
-        return (spatial.plan(tables, state, faster)[0].force * jnp.arange(12.0).reshape(4, 3)).sum()
+    own = tables.params.spatial
 
-    got = jax.jit(jax.grad(pressed))(jnp.zeros(3))
-    for axis, step in enumerate(1e-5 * np.eye(3)):
+    def pressed(change):
+        """Of changes of the velocity, and of the logarithms of five kinds of weights."""
+        faster = seen._replace(base_vel=seen.base_vel + change[:3])
+        factors = jnp.exp(change[3:])
+        weights = type(own.weights)(*(w * f for w, f in zip(own.weights, factors, strict=True)))
+        changed = with_params(tables, spatial=own._replace(weights=weights))
+        force = spatial.plan(changed, state, faster)[0].force
+        return (force * jnp.arange(12.0).reshape(4, 3)).sum()
+
+    got = jax.jit(jax.grad(pressed))(jnp.zeros(8))
+    for axis, step in enumerate(1e-5 * np.eye(8)):
         wanted = (pressed(jnp.asarray(step)) - pressed(jnp.asarray(-step))) / 2e-5
         np.testing.assert_allclose(got[axis], wanted, rtol=1e-3)
 

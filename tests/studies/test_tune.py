@@ -9,7 +9,8 @@ import pytest
 
 from kjax import RunConfig, load_config
 from kjax.runs.cache import Cache
-from kjax.studies.tune import study
+from kjax.studies.tune import report, study
+from kjax.studies.tune.options import parse_task
 from kjax.tuning.space import build_space
 
 
@@ -187,8 +188,9 @@ def test_an_evolution_that_was_interrupted_goes_on_as_if_it_had_not_been(evoluti
         (["--scenarios", "0"], "--scenarios: got 0, wanted more than 0"),
         (["--sim.base", "free"], "wanted 'planar'"),
         (["--worsn", "3"], "did you mean --worsen"),
+        (["--keys", "spatial.force"], "'spatial.force' has no effect with controller = 'planar'"),
     ],
-    ids=["key", "count", "base", "option"],
+    ids=["key", "count", "base", "option", "other controller"],
 )
 def test_a_mistake_is_one_line(call, repository, capsys, tmp_path, words, text):
     config = repository / "configs" / "trot_velocity.toml"
@@ -196,3 +198,25 @@ def test_a_mistake_is_one_line(call, repository, capsys, tmp_path, words, text):
     err = capsys.readouterr().err
     assert text in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_in_three_dimensions_speeds_keys_and_the_table_are_those_of_its_controller(
+    repository, capsys, call, tmp_path
+):
+    config = repository / "configs" / "omni_trot.toml"
+    _, task = parse_task([str(config)], "title")
+    assert task.speeds == ((-0.4, 0.0, -1.0), (0.8, 0.3, 1.5))
+    assert {"spatial.attitude", "lateral.foothold_gain", "leg.foothold_gain"} <= set(task.keys)
+    episodes = study.mujoco_scenarios(load_config(RunConfig, config), task)
+    assert all(len(one.command.yaw_rate) == task.pieces for one in episodes)
+    for column, low, high in zip(("v_x", "v_y", "yaw_rate"), *task.speeds, strict=True):
+        drawn = np.array([getattr(one.command, column) for one in episodes])
+        assert (drawn >= low).all()
+        assert (drawn <= high).all()
+    assert call(study.main, config, "--keys", "lmpc.Q", "--out", tmp_path) == 2
+    assert "'lmpc.Q' has no effect with controller = 'spatial'" in capsys.readouterr().err
+    told = {"median": 0.1, "worst": 0.2}
+    entry = {"runs": 1, "falls": 0, "cost_median": 1.0, "roll_p95_deg": told}
+    text = report.table({"mujoco": {"own": entry}, "held_out_cost": {"own": 2.0}})
+    assert "roll, 95 % [deg]" in text
+    assert "v_y" not in text

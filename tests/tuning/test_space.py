@@ -109,3 +109,15 @@ def test_what_cannot_be_tuned_is_refused_by_name(keys, overrides, text):
     config = load_config(RunConfig, None, overrides)
     with pytest.raises(ValueError, match=text):
         build_space(config, keys)
+
+
+def test_in_three_dimensions_the_variables_give_the_config_s_own_parameters_and_fit_nothing():
+    config = load_config(RunConfig, None, {"controller": "spatial"})
+    keys = [key for key in TUNABLE if key.startswith("spatial.")]
+    space = build_space(config, [*keys, "lateral.foothold_gain", "srb.mass"])
+    ours, theirs = space.params(space.start), resolve(config, go1.PARAMS)[1]
+    assert ours.fits is None
+    pairs = zip(jax.tree.leaves(ours.spatial), jax.tree.leaves(theirs.spatial), strict=True)
+    for own, wanted in pairs:
+        np.testing.assert_allclose(own, wanted, rtol=1e-12)
+    np.testing.assert_allclose(ours.lateral.foothold_gain, theirs.lateral.foothold_gain, rtol=1e-12)

@@ -1,10 +1,10 @@
 """Tune the controller by gradients through its closed loop, then see what MuJoCo says.
 
-Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body on legs
-without mass, the controller's own plan, 200 QPs a second), with others held out. With --baseline
-CMA-ES (pycma) tunes the same parameters in MuJoCo itself, for the same wall time; with --refine it
-goes on from the descent's result. All results, the start and the config's own parameters then run
-the config's whole command in MuJoCo on other seeds.
+Adam descends on random scenarios of a differentiable plant (``kjax.tuning``: a rigid body, planar
+or in three dimensions as the controller is, its own plan, 200 QPs a second), with others held out.
+With --baseline CMA-ES (pycma) tunes the same parameters in MuJoCo itself, for the same wall time;
+with --refine it goes on from the descent's result. All results, the start and the config's own
+parameters then run the config's whole command in MuJoCo on other seeds.
 
 Leaves tuned.toml, metrics.json, table.md and figure.png in the output folder. The state is kept
 there as well: the same command goes on after Ctrl-C or a kill.
@@ -14,7 +14,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +23,14 @@ from tqdm import tqdm
 
 from kjax import cli
 from kjax.config import CommandConfig, RunConfig
-from kjax.options import RunOptions, fail, parse_config, require
+from kjax.options import fail
 from kjax.runs.cache import Cache, open_cache
 from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.resolve import batch_spec, resolve_episodes
 from kjax.sim.summary import summarise
 from kjax.studies.tune import report
+from kjax.studies.tune.options import DRAWN, Task, parse_task
 from kjax.tuning import loop
 from kjax.tuning.optimise import Descent, build_objective, descend
 from kjax.tuning.space import Space, Variables, build_space, tuned_config
@@ -40,66 +40,9 @@ POPULATION_SEEDS = 4  # MuJoCo episodes per candidate of the baseline
 SIGMA = 0.5  # of a first population, about a factor of 1.6
 
 
-@dataclass(kw_only=True)
-class TuneOptions(RunOptions):
-    """Options of a tuning."""
-
-    keys: tuple[str, ...] = ()
-    """What to tune, e.g. lmpc.Q lmpc.R; the gait's weights if left out."""
-
-    scenarios: int = 16
-    """To descend on."""
-
-    held_out: int = 32
-    """To choose the best point on."""
-
-    seconds: float = 3.0
-    """Length of a scenario."""
-
-    pieces: int = 2
-    """Velocities in a scenario's command."""
-
-    updates: int = 150
-    """Of Adam, at most."""
-
-    rate: float = 0.15
-    """Of Adam, in the log of a weight."""
-
-    patience: int = 40
-    """Updates without improvement."""
-
-    minutes: float = 15.0
-    """Wall time, at most."""
-
-    worsen: float = 1.0
-    """Begin with every parameter off by this factor, up or down."""
-
-    worsen_seed: int = 0
-    """Of which are up, which down."""
-
-    memory: float = 0.1
-    """Of the derivatives [s]; inf for the true ones, which a chaotic loop makes useless."""
-
-    baseline: bool = False
-    """CMA-ES in MuJoCo from the same start, for the same time."""
-
-    refine: bool = False
-    """CMA-ES in MuJoCo from the descent's result, likewise."""
-
-    seeds: int = 16
-    """Episodes in MuJoCo at the end."""
-
-
-@dataclass(kw_only=True)
-class Task(TuneOptions):
-    """Options, and what follows from the config: the range of velocities."""
-
-    speeds: tuple[float, float]
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line and run; exit code 0 if all went well."""
-    config, args = _parse(argv)
+    config, args = parse_task(argv, __doc__.splitlines()[0])
     cli.configure_jax()
     folder = cli.output_folder(args, "tune")
     try:
@@ -213,31 +156,6 @@ def _record(args: Task, result: Descent, searches: dict[str, dict[str, Any]]) ->
     }  # fmt: skip
 
 
-def _parse(argv: Sequence[str] | None) -> tuple[RunConfig, Task]:
-    config, given = parse_config(TuneOptions, argv, __doc__.splitlines()[0])
-    names = ("scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
-             "minutes", "worsen", "memory", "seeds")  # fmt: skip
-    require(given, *names, above=0)
-    if config.sim.base != "planar":
-        fail(f"sim.base: got '{config.sim.base}', wanted 'planar': the plant is planar")
-    speeds = min(config.command.v_x), max(config.command.v_x)
-    task = Task(**vars(given), speeds=speeds)
-    task.keys = task.keys or _own_keys(config)
-    return config, task
-
-
-def _own_keys(config: RunConfig) -> tuple[str, ...]:
-    """Weights of the config's gait, and its foothold gain where it has one of its own."""
-    name = config.gait.names[0]
-    own = config.gaits[name]
-    keys = [
-        f"gaits.{name}.{key}"
-        for key in ("Q", "R", "foothold_gain")
-        if getattr(own, key) is not None
-    ]
-    return tuple(keys) or ("lmpc.Q", "lmpc.R")
-
-
 def _settings(args: Task) -> list[Any]:
     """Options that the descent depends on."""
     names = ("keys", "scenarios", "held_out", "seconds", "pieces", "updates", "rate", "patience",
@@ -333,14 +251,18 @@ def mujoco_scenarios(config: RunConfig, args: Task) -> list[RunConfig]:
     rng = np.random.default_rng(TRAIN_SEED)
     low, high = args.speeds
     times = tuple(float(i) * args.seconds / args.pieces for i in range(args.pieces))
+    names = DRAWN[config.controller]
+
+    def drawn() -> dict[str, tuple[float, ...]]:
+        columns = rng.uniform(low, high, (args.pieces, len(names))).T
+        return {name: tuple(column.tolist()) for name, column in zip(names, columns, strict=True)}
+
     return [
         dataclasses.replace(
             config,
             seed=TRAIN_SEED + i,
             sim=dataclasses.replace(config.sim, contacts="feet"),
-            command=CommandConfig(
-                times=times, v_x=tuple(map(float, rng.uniform(low, high, args.pieces)))
-            ),
+            command=CommandConfig(times=times, **drawn()),
         )
         for i in range(POPULATION_SEEDS)
     ]
@@ -354,7 +276,8 @@ def verdict_of(config: RunConfig, overrides: dict[str, Any], seeds: int) -> dict
     if recording.interrupted:
         raise KeyboardInterrupt
     rows = summarise(recording.metrics())
-    keep = ("velocity_rmse_mps", "pitch_p95_deg", "pitch_max_deg", "foot_slip_m",
+    keep = ("velocity_rmse_mps", "velocity_y_rmse_mps", "yaw_rate_rmse_radps", "roll_p95_deg",
+            "pitch_p95_deg", "pitch_max_deg", "foot_slip_m",
             "torque_saturation_fraction")  # fmt: skip
     costs = recording_costs(recording)
     return {
