@@ -376,6 +376,7 @@ def _as_left(name: str) -> Callable[[], str]:
 for _name in (
     "tune_trot",
     "tune_bound",
+    "tune_omni",
     "learn_control",
     "spatial",
     "spatial_mjx",

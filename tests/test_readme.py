@@ -186,6 +186,8 @@ def require_command(words):
     modules = [module, "kjax.options"]
     if verb == "bench":
         modules += ["kjax.bench.options", *bench.MODULES.values()]
+    if verb == "tune":
+        modules += ["kjax.studies.tune.options"]
     source = "".join(inspect.getsource(importlib.import_module(name)) for name in modules)
     for option in rest:
         name = option.partition("=")[0].removeprefix("--")
