@@ -69,6 +69,7 @@ WRENCH_COST = Unit(
 )
 
 Six = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
+Three = tuple[NonNegative, NonNegative, NonNegative]
 COST = Tunable(low=1e-12)
 GRF = Tunable(low=0.01, high=8.0)
 MIN_GRF = Tunable(unit=0.08, low=-0.8, high=0.8)

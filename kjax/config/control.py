@@ -33,6 +33,7 @@ from kjax.config.checks import (
     NonNegative,
     Positive,
     Six,
+    Three,
     TorqueFraction,
     Tunable,
     require_fraction,
@@ -175,9 +176,6 @@ class MultiPhaseConfig:
     """Iteration limit of the QP [-]."""
 
 
-Three = tuple[NonNegative, NonNegative, NonNegative]
-
-
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SpatialConfig:
     """LMPC in three dimensions, for controller = "spatial".
@@ -185,9 +183,14 @@ class SpatialConfig:
     Weights are per second of the horizon, of errors ahead, to the left and up.
     """
 
-    model: Literal["momentum", "convex", "present"] = "momentum"
-    """What predicts: exact momentum about the last plan's roll-out; Di Carlo's convex model; or the
-    rigid body linearised where the robot is [-]."""
+    model: Literal["momentum", "convex", "present", "edmd", "bilinear"] = "momentum"
+    """What predicts: exact momentum about the last plan's roll-out; Di Carlo's convex model; the
+    rigid body linearised where the robot is; or EDMD on SO(3) observables, linear or bilinear
+    [-]."""
+    snapshots: Annotated[int, Field(ge=100)] = 4000
+    """Steps that EDMD learns from, where the model is a learned one [-]."""
+    training_seed: Annotated[int, Field(ge=0)] = 0
+    """Of these [-]."""
     horizon: Positive = 0.25
     """Length of the prediction, at most a gait cycle [s]."""
     node_dt: Positive = 0.025

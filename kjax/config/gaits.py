@@ -22,15 +22,21 @@ from kjax.config.checks import (
     INPUT_COST,
     LENGTH,
     MIN_GRF,
+    OMEGA_COST,
+    POSITION_COST,
     STATE_COST,
     STRICT,
+    VELOCITY_COST,
     Positive,
     Six,
+    Three,
     Tunable,
 )
 
 Offset = Annotated[float, Field(ge=0, lt=1)]
 Duty = Annotated[float, Field(gt=0, le=1)]
+# Weights of the plan in three dimensions, of ``[spatial]`` and of each gait.
+SPATIAL_WEIGHTS = ("attitude", "position", "omega", "velocity", "force")
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -86,6 +92,17 @@ class GaitConfig:
     swing_height: Annotated[float | None, Field(gt=0), LENGTH] = None
     """Height of the swing's apex above the higher of lift-off and target; leg.swing_height if not
     given [L]."""
+    attitude: Annotated[Three | None, COST] = None
+    """Weights of the squared errors of roll, pitch and yaw of the plan in three dimensions, per
+    second; spatial.attitude if not given, as the four below [1/rad^2]."""
+    position: Annotated[Three | None, COST, POSITION_COST] = None
+    """Of the centre of mass's place [1/L^2]."""
+    omega: Annotated[Three | None, COST, OMEGA_COST] = None
+    """Of the angular velocity [L/g]."""
+    velocity: Annotated[Three | None, COST, VELOCITY_COST] = None
+    """Of the centre of mass's velocity [1/(g L)]."""
+    force: Annotated[float | None, Field(gt=0), COST, INPUT_COST] = None
+    """Of every squared force's distance from the gait's mean force [1/(m g)^2]."""
 
     @model_validator(mode="after")
     def _check(self) -> "GaitConfig":
@@ -230,7 +247,7 @@ def on_library(tables: Any) -> Any:
 
 
 def gait_setting(config: Any, name: str, key: str) -> Any:
-    """A gait's own value, or that of ``[lmpc]`` or ``[leg]`` where it gives none.
+    """A gait's own value, or that of ``[lmpc]``, ``[leg]`` or ``[spatial]`` where it gives none.
 
     Args:
       config: of a run, or an ``Overlay``.
@@ -248,7 +265,9 @@ def setting_key(config: Any, name: str, key: str) -> str:
 
 
 def _fallback(key: str) -> str:
-    return "leg" if key in ("swing_height", "foothold_gain") else "lmpc"
+    if key in ("swing_height", "foothold_gain"):
+        return "leg"
+    return "spatial" if key in SPATIAL_WEIGHTS else "lmpc"
 
 
 def reachable_gaits(gaits: Gaits, names: Iterable[str]) -> list[str]:

@@ -12,6 +12,7 @@ from kjax import gait
 from kjax.concrete import is_concrete
 from kjax.dynamics.srb_spatial import SpatialBody
 from kjax.koopman.models import LinearModel
+from kjax.koopman.so3 import So3Model
 from kjax.legs import lateral, swing
 from kjax.mpc import horizon, momentum
 from kjax.mpc.lmpc import LmpcTables, ModeSettings, build_tables
@@ -42,7 +43,7 @@ class SpatialParams(NamedTuple):
 
     Attributes:
       body: mass and inertia of the prediction.
-      weights: of the errors, per second.
+      weights: of the errors, per second; each gait's (G, ...).
       limits: of the forces.
       grid: (2,) length of the horizon, and longest node where two feet stand [s].
       force_z: (G, 2) mean vertical force of a front and a rear leg in its stance [N].
@@ -54,6 +55,7 @@ class SpatialParams(NamedTuple):
         [m/s, m/s, rad].
       slope_time: in which the slope of the ground is filtered [s].
       alignment: part of that slope that the trunk takes [-].
+      learned: what EDMD has found, where the model is a learned one.
     """
 
     body: SpatialBody
@@ -68,6 +70,7 @@ class SpatialParams(NamedTuple):
     integral: Float[Array, "2 3"]
     slope_time: Float[Array, ""]
     alignment: Float[Array, ""]
+    learned: So3Model | None = None
 
 
 class ControllerParams(NamedTuple):

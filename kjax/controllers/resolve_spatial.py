@@ -1,16 +1,25 @@
 """From a config to the LMPC in three dimensions: its spec and its parameters."""
 
+from functools import lru_cache
 from itertools import accumulate
 from math import ceil
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from kjax import gait
 from kjax.concrete import array_library, stacked
 from kjax.config import SpatialConfig
+from kjax.config.gaits import SPATIAL_WEIGHTS, gait_setting
 from kjax.config.units import InSi
 from kjax.controllers.params import SpatialParams
 from kjax.controllers.rigid_body import body_numbers, mean_force
+from kjax.dynamics import spatial_data
+from kjax.dynamics.spatial_data import footholds
 from kjax.dynamics.srb_spatial import SpatialBody
+from kjax.koopman import so3
 from kjax.mpc import momentum
 from kjax.spec import SpatialSpec
 from kjax.types import RobotParams
@@ -48,11 +57,10 @@ def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> 
     return SpatialParams(
         body=SpatialBody(mass=xp.asarray(mass, float), inertia=xp.asarray(inertia, float)),
         weights=momentum.Weights(
-            attitude=_floats(own.attitude),
-            position=_floats(own.position),
-            omega=_floats(own.omega),
-            velocity=_floats(own.velocity),
-            force=_floats(own.force),
+            **{
+                key: stacked([gait_setting(config, one.name, key) for one in gaits])
+                for key in SPATIAL_WEIGHTS
+            }
         ),
         limits=momentum.Limits(
             friction=_floats(own.friction),
@@ -68,7 +76,34 @@ def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> 
         integral=stacked([own.integral_gains, own.integral_limits]),
         slope_time=_floats(own.slope_time),
         alignment=_floats(own.alignment),
+        learned=_learned(own, robot, mass, inertia),
     )
+
+
+LEARNED = {"edmd": False, "bilinear": True}  # names of the models, and whether they are bilinear
+
+
+def _learned(own: InSi, robot: RobotParams, mass: Any, inertia: Any) -> so3.So3Model | None:
+    """What EDMD finds of the rigid body, NumPy in float64; ``None`` for the other models."""
+    if own.model not in LEARNED:
+        return None
+    numbers = tuple(np.asarray(a, float).tobytes() for a in (mass, inertia, footholds(robot)))
+    return _fit(numbers, LEARNED[own.model], own.snapshots, own.training_seed, own.node_dt / 2)
+
+
+@lru_cache(maxsize=16)
+def _fit(
+    numbers: tuple[bytes, ...], bilinear: bool, snapshots: int, seed: int, dt: float
+) -> so3.So3Model:
+    """The fit of one body and its footholds, from their bytes."""
+    mass, inertia, feet = (np.frombuffer(one) for one in numbers)
+    with jax.enable_x64(True):
+        body = SpatialBody(jnp.asarray(mass[0]), jnp.asarray(inertia.reshape(3, 3)))
+        data = spatial_data.draw(
+            body, feet.reshape(4, 3), [seed, 4], range(4),
+            count=snapshots, nodes=1, dt=dt, anywhere=True,
+        )  # fmt: skip
+        return jax.device_get(so3.fit_body(data, dt, bilinear=bilinear))
 
 
 def _floats(value: Any) -> Any:

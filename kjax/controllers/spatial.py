@@ -26,6 +26,7 @@ from kjax.legs.footholds import Arrival, footholds, turned
 from kjax.legs.ground import next_slope, rise, soles, upright
 from kjax.mpc import grid, momentum
 from kjax.mpc.momentum import MomentumMemory
+from kjax.mpc.response import PredictionTask, Targets
 from kjax.mpc.rigid_models import PREDICTIONS
 from kjax.spec import ControllerSpec, SpatialSpec
 
@@ -128,14 +129,16 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
             params, clock, nodes, motion, touching - origin[None], com, slope.slope
         )
         nominal = momentum.shifted(state.memory, nodes, targets.force, control_dt)
-        response = predict(own.body, start, nodes.length, contacts, nominal, targets)
+        response = predict(
+            PredictionTask(own.body, start, nodes.length, contacts, nominal, targets, own.learned)
+        )
         torques = _torque_maps(params, response.states, contacts, com)
         solved = momentum.solve(
             response,
             nodes,
             nominal,
             targets,
-            own.weights,
+            jax.tree.map(lambda a: a[clock.gait], own.weights),
             momentum.foot_rows(own.limits, upright(slope.slope), torques),
             grid.list_feet(nodes.stance, sizes.feet),
             tolerance=sizes.tolerance,
@@ -221,7 +224,7 @@ def _targets(
     nodes: grid.Grid,
     motion: _Motion,
     slope: Float[Array, "2"],
-) -> momentum.Targets:
+) -> Targets:
     """What the body shall do at the nodes' ends, in the frame of the plan."""
     own = params.spatial
     assert own is not None
@@ -258,7 +261,7 @@ def _targets(
     load = own.force_z[clock.gait] * (cycle / jnp.sum(jnp.where(used, full, 0.0)))
     force_z = jnp.where(nodes.stance, jnp.repeat(load, 2)[None], 0.0)
     flat = jnp.zeros_like(force_z)
-    return momentum.Targets(
+    return Targets(
         R=R,
         p=jnp.concatenate([place, height[:, None]], axis=1),
         omega=jnp.einsum("kij,kj->ki", R_yaw, omega.T),

@@ -25,31 +25,11 @@ from kjax.dynamics import rotations, srb_spatial
 from kjax.dynamics.rotations import skew
 from kjax.dynamics.srb_spatial import BodyState, Contacts, SpatialBody
 from kjax.mpc.grid import FootNodes, Grid
+from kjax.mpc.response import STATE, Response, Targets
 
 # Of the pyramid in place of the friction cone. At a corner it allows 1 / cos(pi / SIDES) times the
 # cone's friction: 1.08, where that with four sides allows 1.41 and the feet slip on a diagonal.
 SIDES = 8
-STATE = 12  # entries of this model's x, and of the errors that the cost weighs
-
-
-class Targets(NamedTuple):
-    """What the body shall do at the nodes' ends.
-
-    Attributes:
-      R: (K, 3, 3) attitude, trunk to world [-].
-      p: (K, 3) centre of mass [m].
-      omega: (K, 3) angular velocity, world [rad/s].
-      v: (K, 3) velocity [m/s].
-      heading: (K, 2) cosine and sine of the heading that weights are given in [-].
-      force: (K, 4, 3) force of each leg that costs nothing [N].
-    """
-
-    R: Float[Array, "K 3 3"]
-    p: Float[Array, "K 3"]
-    omega: Float[Array, "K 3"]
-    v: Float[Array, "K 3"]
-    heading: Float[Array, "K 2"]
-    force: Float[Array, "K 4 3"]
 
 
 class Weights(NamedTuple):
@@ -112,25 +92,6 @@ class MomentumMemory(NamedTuple):
     force: Float[Array, "K 4 3"]
     end: Float[Array, "K"]
     planned: Bool[Array, ""]
-
-
-class Response(NamedTuple):
-    """Prediction about a nominal roll-out, by this model or another one, of n states x.
-
-    Attributes:
-      states: nominal ones (K + 1, ...), the first one now.
-      omega: (K, 3) nominal angular velocity at the nodes' ends [rad/s].
-      A: (K, n, n).
-      B: (K, 4, n, 3) of each leg's force.
-      outputs: (K, 12, n) changes of attitude (a turn of the nominal one, world), place, angular
-        velocity and velocity by x at the nodes' ends.
-    """
-
-    states: BodyState
-    omega: Float[Array, "K 3"]
-    A: Float[Array, "K n n"]
-    B: Float[Array, "K 4 n 3"]
-    outputs: Float[Array, "K 12 n"]
 
 
 class MomentumPlan(NamedTuple):

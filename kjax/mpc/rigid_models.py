@@ -1,4 +1,4 @@
-"""Rigid-body models that others predict with, as a ``momentum.Response``: to compare with.
+"""Rigid-body models that others predict with, as a ``Response``: to compare with.
 
 ``convex``: Di Carlo et al., Dynamic Locomotion in the MIT Cheetah 3 Through Convex Model-Predictive
 Control (2018). Small roll and pitch, no gyroscopic term, levers from the reference's path:
@@ -7,9 +7,9 @@ Control (2018). Small roll and pitch, no gyroscopic term, levers from the refere
 
 ``present``: the rigid body linearised in state and forces where the robot is, held over the
 horizon.
-"""
 
-from collections.abc import Callable
+``edmd``, ``bilinear``: learned ones, see ``mpc.learned_models``.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -17,21 +17,15 @@ from jaxtyping import Array, Float
 
 from kjax.dynamics import rotations, srb_spatial
 from kjax.dynamics.rotations import skew
-from kjax.dynamics.srb_spatial import BodyState, SpatialBody
-from kjax.mpc.momentum import STATE, Response, Targets, linearise
+from kjax.dynamics.srb_spatial import BodyState
+from kjax.mpc import learned_models
+from kjax.mpc.momentum import linearise
+from kjax.mpc.response import STATE, Prediction, PredictionTask, Response
 
-Prediction = Callable[[SpatialBody, BodyState, Array, Array, Array, Targets], Response]
 
-
-def convex(
-    body: SpatialBody,
-    start: BodyState,
-    length: Float[Array, "K"],
-    feet: Float[Array, "K 4 3"],
-    nominal: Float[Array, "K 4 3"],
-    targets: Targets,
-) -> Response:
-    """Di Carlo's model; arguments as of ``momentum.linearise``, levers and yaw of the targets."""
+def convex(task: PredictionTask) -> Response:
+    """Di Carlo's model, levers and yaw of the targets."""
+    body, start, length, feet, nominal, targets, _ = task
     heading = targets.heading
     zero = jnp.zeros_like(heading[:, 0])
     Rz = jnp.stack(
@@ -78,16 +72,9 @@ def convex(
     return Response(states, xs[:, 6:9], A, B, outputs)
 
 
-def present(
-    body: SpatialBody,
-    start: BodyState,
-    length: Float[Array, "K"],
-    feet: Float[Array, "K 4 3"],
-    nominal: Float[Array, "K 4 3"],
-    targets: Targets,
-) -> Response:
-    """Linearised at the present state and forces; arguments as of ``momentum.linearise``."""
-    del targets
+def present(task: PredictionTask) -> Response:
+    """Linearised at the present state and forces."""
+    body, start, length, feet, nominal, _, _ = task
     eye = jnp.eye(3, dtype=start.p.dtype)
     omega = srb_spatial.angular_velocity(body, start.R, start.L)
 
@@ -159,21 +146,15 @@ def _from_angles(angles: Float[Array, "K 3"]) -> Float[Array, "K 3 3"]:
     return about(2) @ about(1) @ about(0)
 
 
-def _momentum(
-    body: SpatialBody,
-    start: BodyState,
-    length: Float[Array, "K"],
-    feet: Float[Array, "K 4 3"],
-    nominal: Float[Array, "K 4 3"],
-    targets: Targets,
-) -> Response:
+def _momentum(task: PredictionTask) -> Response:
     """``momentum.linearise``, which needs no targets."""
-    del targets
-    return linearise(body, start, length, feet, nominal)
+    return linearise(task.body, task.start, task.length, task.feet, task.nominal)
 
 
 PREDICTIONS: dict[str, Prediction] = {
     "momentum": _momentum,
     "convex": convex,
     "present": present,
+    "edmd": learned_models.edmd,
+    "bilinear": learned_models.bilinear,
 }

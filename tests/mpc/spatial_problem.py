@@ -7,7 +7,8 @@ import numpy as np
 from kjax.dynamics import rotations, srb_spatial
 from kjax.dynamics.srb_spatial import BodyState, SpatialBody
 from kjax.gait import Clock, Gait, Phase, build_schedule
-from kjax.mpc import grid, momentum
+from kjax.mpc import grid
+from kjax.mpc.response import Targets
 
 INERTIA = [[0.1273, -0.0004, -0.0144], [-0.0004, 0.3944, -0.0001], [-0.0144, -0.0001, 0.4228]]
 BODY = SpatialBody(mass=jnp.asarray(12.743), inertia=jnp.asarray(INERTIA))
@@ -60,7 +61,7 @@ def problem(seed=0, which=0):
 
 def targets(found, force):
     K = len(found.length)
-    return momentum.Targets(
+    return Targets(
         R=np.tile(np.eye(3), (K, 1, 1)),
         p=np.stack([0.3 * found.end, 0.0 * found.end, 0.27 + 0.0 * found.end], axis=-1),
         omega=np.zeros((K, 3)),

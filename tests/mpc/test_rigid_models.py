@@ -1,17 +1,34 @@
 """The models that others predict with, against the nonlinear roll-out."""
 
+from functools import cache
+
 import jax
 import numpy as np
 import pytest
-from spatial_problem import BODY, problem, rollout, targets
+from spatial_problem import BODY, HIPS, problem, rollout, targets
 
-from kjax.dynamics import rotations, srb_spatial
+from kjax.dynamics import rotations, spatial_data, srb_spatial
 from kjax.dynamics.srb_spatial import Contacts
+from kjax.koopman import so3
+from kjax.mpc.response import PredictionTask
 from kjax.mpc.rigid_models import PREDICTIONS
 
 NAMES = sorted(PREDICTIONS)
 MODELS = {name: jax.jit(predict) for name, predict in PREDICTIONS.items()}
 log = jax.jit(rotations.log)
+# EDMD's mean over tilted bodies is not what a level one does; with products it is nearly so.
+ROUGH = {"edmd": 0.5, "bilinear": 0.2}
+
+
+@cache
+def learned(name):
+    """What EDMD finds of the body, of the models that learn."""
+    if name not in ("edmd", "bilinear"):
+        return None
+    data = spatial_data.draw(
+        BODY, HIPS, [0], range(4), count=1500, nodes=1, dt=0.0125, anywhere=True
+    )
+    return so3.fit_body(data, 0.0125, bilinear=name == "bilinear")
 
 
 @jax.jit
@@ -40,7 +57,9 @@ def setting(seed=0, tilt=1.0):
 
 
 def response(name, start, found, feet, nominal, wanted):
-    predicted = MODELS[name](BODY, start, found.length, feet, nominal, wanted)
+    predicted = MODELS[name](
+        PredictionTask(BODY, start, found.length, feet, nominal, wanted, learned(name))
+    )
     return jax.tree.map(np.asarray, predicted)
 
 
@@ -83,9 +102,10 @@ def test_near_a_level_body_at_rest_all_models_turn_as_the_rigid_body_does(name):
     x = moved(found, predicted, change)[:10]
     wanted_turn = np.asarray(log(R_moved @ np.swapaxes(R, 1, 2)))[1:11]
     scale = np.abs(wanted_turn).max()
-    np.testing.assert_allclose(x[:, :3], wanted_turn, atol=0.1 * scale)
+    close = ROUGH.get(name, 0.1)
+    np.testing.assert_allclose(x[:, :3], wanted_turn, atol=close * scale)
     missed = np.abs(x[:, 6:9] - (rate_moved - rate)[1:11]).max()
-    assert missed < 0.1 * np.abs(rate_moved - rate).max()
+    assert missed < close * np.abs(rate_moved - rate).max()
 
 
 @pytest.mark.parametrize(("name", "worst"), [("momentum", 1e-9), ("present", 0.05)])
@@ -110,3 +130,45 @@ def test_the_convex_model_neglects_roll_and_pitch_and_the_gyroscopic_moment():
     moment = np.cross(feet[3] - middle, nominal[3]).sum(axis=0)
     step = predicted.omega[3] - predicted.omega[2]
     np.testing.assert_allclose(step, found.length[3] * W @ moment, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["edmd", "bilinear"])
+def test_learned_models_are_linearised_about_their_own_roll_out(name):
+    """Any heading: small changes of the forces change the roll-out as A, B and outputs say."""
+    start, found, feet, nominal, wanted = setting(7)
+    ahead = np.tile([np.cos(2.0), np.sin(2.0)], (len(found.length), 1))
+    wanted = wanted._replace(heading=ahead)
+    predicted = response(name, start, found, feet, nominal, wanted)
+    change = 1e-3 * np.random.default_rng(8).normal(size=nominal.shape) * found.stance[..., None]
+    moved_up, moved_down = (
+        response(name, start, found, feet, nominal + sign * change, wanted) for sign in (1, -1)
+    )
+    x = moved(found, predicted, change)
+    turned = np.asarray(log(moved_up.states.R @ np.swapaxes(moved_down.states.R, 1, 2)))[1:] / 2
+    for columns, true in (
+        (slice(0, 3), turned),
+        (slice(3, 6), (moved_up.states.p - moved_down.states.p)[1:] / 2),
+        (slice(6, 9), (moved_up.omega - moved_down.omega) / 2),
+        (slice(9, 12), (moved_up.states.v - moved_down.states.v)[1:] / 2),
+    ):
+        np.testing.assert_allclose(x[:, columns], true, atol=1e-5 * np.abs(true).max())
+
+
+@pytest.mark.parametrize("name", ["edmd", "bilinear"])
+def test_learned_models_turn_with_the_robot(name):
+    """The whole problem turned about the vertical gives the whole response turned."""
+    start, found, feet, nominal, wanted = setting(9)
+    Rz = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    one = response(name, start, found, feet, nominal, wanted)
+    turned = start._replace(p=Rz @ start.p, R=Rz @ start.R, v=Rz @ start.v, L=Rz @ start.L)
+    aside = wanted._replace(
+        R=Rz @ wanted.R, p=wanted.p @ Rz.T, v=wanted.v @ Rz.T, omega=wanted.omega @ Rz.T,
+        heading=wanted.heading @ Rz[:2, :2].T,
+    )  # fmt: skip
+    other = response(name, turned, found, feet @ Rz.T, nominal @ Rz.T, aside)
+    np.testing.assert_allclose(other.states.R, Rz @ one.states.R, atol=1e-9)
+    np.testing.assert_allclose(other.states.p, one.states.p @ Rz.T, atol=1e-9)
+    np.testing.assert_allclose(other.omega, one.omega @ Rz.T, atol=1e-8)
+    change = np.random.default_rng(1).normal(size=nominal.shape) * found.stance[..., None]
+    x, y = moved(found, one, change), moved(found, other, change @ Rz.T)
+    np.testing.assert_allclose(y.reshape(-1, 4, 3), x.reshape(-1, 4, 3) @ Rz.T, atol=1e-8)
