@@ -58,13 +58,23 @@ class CycleSpec:
 
     Attributes:
       nodes: largest number of nodes of a gait's cycle.
+      linearise: what the prediction is made about: a forecast path, or the last plan's roll-out.
       tolerance: relative residuals and gap at which the QP counts as solved [-].
       max_iterations: limit of the QP.
     """
 
     nodes: int
+    linearise: Literal["forecast", "last_plan"] = "forecast"
     tolerance: float = 1e-6
     max_iterations: int = 30
+
+    @property
+    def grid(self) -> int:
+        """Number of nodes of a horizon.
+
+        The present phase may hold one more, part of them now and part a cycle later.
+        """
+        return self.nodes + 1
 
 
 @dataclass(frozen=True, kw_only=True)

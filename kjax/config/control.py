@@ -170,6 +170,9 @@ class MultiPhaseConfig:
     """Time in which the velocity is predicted to reach its reference, for moment arms [s]."""
     height_time: Annotated[Positive, TIME] = 0.095
     """The same of height and pitch [s]."""
+    linearise: Literal["forecast", "last_plan"] = "forecast"
+    """What moment arms are taken from: a path with these times, as if it did not depend on the
+    forces; or the last plan's roll-out, and how forces move body and footholds from it [-]."""
     tolerance: Positive = 1e-6
     """Relative residuals and gap at which the QP counts as solved [-]."""
     max_iterations: Count = 30

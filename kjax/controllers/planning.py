@@ -16,6 +16,7 @@ from kjax.controllers.params import ControllerParams, Tables
 from kjax.koopman.models import LinearModel, input_map
 from kjax.legs.kinematics import PlanarState
 from kjax.mpc import horizon, multiphase
+from kjax.mpc.cycle_rollout import CycleMemory, aged, shifted
 from kjax.mpc.limits import force_limits
 from kjax.mpc.lmpc import LmpcMemory, shift_plan, solve_lmpc
 from kjax.prediction.build import build_family
@@ -166,7 +167,12 @@ def _build_stance_planner(spec: ControllerSpec) -> Planner:
         steps = jnp.where(usable, solution.plan, fallback)
         return ForcePlan(
             force=_on_legs(steps[:4].reshape(2, 2) @ body.rotation.T, task.stance),
-            memory=LmpcMemory(plan=steps, problem=problem, warm=solution.warm),
+            memory=LmpcMemory(
+                plan=steps,
+                problem=problem,
+                warm=solution.warm,
+                cycle=aged(task.memory.cycle, spec.control_dt),
+            ),
             status=solution.status,
             residual=solution.residual,
             iterations=solution.iterations,
@@ -201,14 +207,12 @@ def reference_trajectory(
 def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
     """A gait cycle ahead, through flight and the next stances."""
     shortest = 0.5 * control_dt
-    # The present phase may hold one node more, part of them now and part a cycle later.
-    count = spec.nodes + 1
 
     def plan(tables: Tables, task: ForceTask) -> ForcePlan:
         params, clock, body = tables.params, task.clock, task.body
         settings = horizon.for_gait(params.multiphase, clock.gait)
         schedule = params.schedule
-        nodes = horizon.build_nodes(settings, schedule, clock, count, shortest)
+        nodes = horizon.build_nodes(settings, schedule, clock, spec.grid, shortest)
         forecast = horizon.predict(
             settings,
             nodes,
@@ -228,6 +232,10 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
                 cycle=nodes.end[-1],
             ),
         )
+        last = task.memory.cycle
+        nominal = None
+        if last is not None:
+            nominal = shifted(last, nodes, forecast.force_z, control_dt)
         solved = multiphase.solve(
             settings,
             params.robot,
@@ -236,16 +244,19 @@ def _build_cycle_planner(spec: CycleSpec, control_dt: float) -> Planner:
             body.x,
             (body.x[:2] - body.base) @ body.rotation,
             spec,
+            nominal,
         )
         # A point that misses its rows by a percent still walks better than none; without one, the
         # feet carry what they carry in the periodic motion.
         usable = (solved.status <= qp.Status.ITERATION_LIMIT) & (solved.residual < 1e-2)
         carry = jnp.stack([jnp.zeros_like(forecast.force_z[0]), forecast.force_z[0]])
         force = jnp.where(usable & task.valid, solved.force[0], carry)
+        if nominal is not None:
+            last = CycleMemory(jnp.where(usable & task.valid, solved.force, nominal), nodes.end)
         standing = jnp.arange(2) == nodes.end_index[0]
         return ForcePlan(
             force=_on_legs(jnp.where(standing[:, None], force, 0.0), task.stance),
-            memory=task.memory._replace(plan=jnp.zeros_like(task.memory.plan)),
+            memory=task.memory._replace(plan=jnp.zeros_like(task.memory.plan), cycle=last),
             status=solved.status,
             residual=solved.residual,
             iterations=solved.iterations,

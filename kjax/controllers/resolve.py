@@ -73,7 +73,12 @@ def controller_spec(config: RunConfig) -> ControllerSpec:
     lmpc, chosen = config.lmpc, config.multiphase
     gaits = build_gaits(config)
     nodes = int(cycle_nodes(gaits, config).sum(axis=1).max())
-    cycle = CycleSpec(nodes=nodes, tolerance=chosen.tolerance, max_iterations=chosen.max_iterations)
+    cycle = CycleSpec(
+        nodes=nodes,
+        linearise=chosen.linearise,
+        tolerance=chosen.tolerance,
+        max_iterations=chosen.max_iterations,
+    )
     return ControllerSpec(
         base=config.sim.base,
         act_dt=config.leg.act_dt,

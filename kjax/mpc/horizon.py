@@ -143,12 +143,16 @@ class HorizonForecast(NamedTuple):
       reference: (K, 6) state wanted at the nodes' ends.
       path: (K, 3) (x, z, theta) expected at the nodes' middles [m, rad].
       foot: (K, 2) contact point of the standing end, world [m].
+      ahead: (K,) of a stance to come, its foothold from the centre of mass at touchdown [m],
+      by_speed: (K,) and further per velocity v_x at touchdown [s].
       force_z: (K,) vertical force per foot that the gait's reference takes [N].
     """
 
     reference: Float[Array, "K 6"]
     path: Float[Array, "K 3"]
     foot: Float[Array, "K 2"]
+    ahead: Float[Array, "K"]
+    by_speed: Float[Array, "K"]
     force_z: Float[Array, "K"]
 
 
@@ -259,4 +263,11 @@ def predict(
     load = share * params.mass * GRAVITY * stances.cycle / stances.duration
     standing = nodes.feet > 0
     force_z = jnp.where(standing, load / jnp.maximum(nodes.feet, 1.0), 0.0)
-    return HorizonForecast(reference=reference, path=path, foot=foot, force_z=force_z)
+    return HorizonForecast(
+        reference=reference,
+        path=path,
+        foot=foot,
+        ahead=params.feet[nodes.end_index] - params.velocity_gain * speed(nodes.begin),
+        by_speed=0.5 * stances.duration + params.velocity_gain,
+        force_z=force_z,
+    )

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from kjax import qp
 from kjax.koopman.models import LinearModel, aggregate, input_map
 from kjax.mpc.condense import CondensedQp, condense, discounted_weights
+from kjax.mpc.cycle_rollout import CycleMemory, start_cycle
 from kjax.mpc.limits import ForceRows
 from kjax.spec import ControllerSpec
 
@@ -55,11 +56,13 @@ class LmpcMemory(NamedTuple):
       plan: (n_u k,) last force plan, body frame [N].
       problem: that it solves; -1 before the first.
       warm: where the QP of that problem may go on from; ``None`` where nothing is carried.
+      cycle: last plan over a gait cycle; ``None`` where none is made about it.
     """
 
     plan: Float[Array, "nu"]
     problem: Int[Array, ""]
     warm: qp.Warm | None
+    cycle: CycleMemory | None = None
 
 
 class ModeSettings(NamedTuple):
@@ -159,8 +162,12 @@ def start_memory(tables: LmpcTables, spec: ControllerSpec) -> LmpcMemory:
     hessian_stays = spec.model.tabulated and not spec.model.measured_feet
     if hessian_stays and spec.warm_start and spec.solver == "tableau":
         warm = qp.start(jax.tree.map(lambda a: a[0], tables.hessian))
+    follows = spec.cycle is not None and spec.cycle.linearise == "last_plan"
     return LmpcMemory(
-        plan=jnp.zeros_like(tables.lower[0]), problem=jnp.full((), -1, jnp.int32), warm=warm
+        plan=jnp.zeros_like(tables.lower[0]),
+        problem=jnp.full((), -1, jnp.int32),
+        warm=warm,
+        cycle=start_cycle(spec.cycle.grid, tables.lower) if spec.cycle and follows else None,
     )
 
 

@@ -9,7 +9,9 @@ of p predicted first, the moment arms are known and the model is linear and time
     omega_k = omega_0                 + sum_{j<=k} h_j alpha_j (r_j x F_j) / I
     p_k     = p_0 + v_0 t_k - g t_k^2/2 + sum_{j<=k} h_j (t_k - t_j) alpha_j F_j / m,   theta alike,
 
-t_k the end of node k, t_j the middle of node j, h_j its length (``mpc.horizon``). Besides a box the
+t_k the end of node k, t_j the middle of node j, h_j its length (``mpc.horizon``). That leaves out
+how the arms change where p leaves its path; ``mpc.cycle_rollout`` has it, and is used in place of
+``response`` where nominal forces are given. Besides a box the
 forces keep to rows: the friction pyramid |F_x| <= mu F_z and joint torque limits |J^T F| <= tau in
 the predicted posture.
 """
@@ -22,6 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from kjax import qp
 from kjax.legs.kinematics import LegTrig, foot_jacobian, inverse
+from kjax.mpc.cycle_rollout import roll_out
 from kjax.mpc.horizon import HorizonForecast, MultiPhaseParams, Nodes
 from kjax.spec import CycleSpec
 from kjax.types import GRAVITY, RobotParams
@@ -53,8 +56,9 @@ def solve(
     x: Float[Array, "6"],
     lever: Float[Array, "2"],
     spec: CycleSpec,
+    nominal: Float[Array, "K 2"] | None = None,
 ) -> MultiPhasePlan:
-    """Forces over the horizon.
+    """Forces over the horizon. Eight arguments: the problem's data, each of another origin.
 
     Args:
       params: weights and limits.
@@ -64,9 +68,17 @@ def solve(
       x: state now.
       lever: (2,) centre of mass in the trunk frame [m].
       spec: tolerance and limit of the QP.
+      nominal: (K, 2) forces whose roll-out the prediction is made about in place of the forecast's
+        path, world frame [N].
     """
     K = nodes.length.shape[0]
-    free, forced = response(params, nodes, forecast, x)
+    if nominal is None:
+        free, forced = response(params, nodes, forecast, x)
+    else:
+        about = roll_out(params, nodes, forecast, x, nominal)
+        forced = about.by_force
+        free = about.states - jnp.einsum("kajf,jf->ka", forced, nominal)
+        forecast = forecast._replace(path=about.path, foot=about.foot)
     weight = params.state_weights[None] * nodes.length[:, None]
     B = forced.reshape(6 * K, 2 * K)
     weighted = B * weight.reshape(-1)[:, None]

@@ -12,7 +12,7 @@ from kjax.config import RunConfig, load_config
 from kjax.config.units import in_si
 from kjax.controllers.resolve import multiphase_params
 from kjax.controllers.walkable import build_gaits, cycle_nodes
-from kjax.mpc import horizon, multiphase
+from kjax.mpc import cycle_rollout, horizon, multiphase
 from kjax.robots import go1
 from kjax.spec import CycleSpec
 from kjax.types import GRAVITY, Leg
@@ -28,6 +28,8 @@ predict = jax.jit(horizon.predict)
 preview = jax.jit(gait.preview, static_argnums=2)
 build_nodes = jax.jit(horizon.build_nodes, static_argnums=(3, 4))
 response = jax.jit(multiphase.response)
+roll_out = jax.jit(cycle_rollout.roll_out)
+shifted = jax.jit(cycle_rollout.shifted, static_argnums=3)
 force_rows = jax.jit(multiphase.force_rows)
 
 
@@ -328,3 +330,120 @@ def test_an_outlook_has_derivatives_where_the_reference_has_arrived(
             (total(velocity, command + h) - total(velocity, command - h)) / (2 * h),
         )
         np.testing.assert_allclose(slopes, wanted, rtol=1e-6, atol=1e-7)
+
+
+def rigid_body_motion(nodes, forecast, x, force):
+    """States at the nodes' ends of the nonlinear body, with feet that Raibert's law puts down.
+
+    One Runge-Kutta step per node is exact: under a held force pitch is a polynomial of degree 4.
+    """
+    nodes, forecast = (jax.tree.map(np.asarray, a) for a in (nodes, forecast))
+    m, inertia = float(go1.PARAMS.mass), float(go1.PARAMS.pitch_inertia) * 0.87
+    now, states, foot, start = np.array(x), [], forecast.foot.copy(), None
+    for k, h in enumerate(nodes.length):
+        if not nodes.present[k]:
+            if nodes.begin[k] != start:
+                start = nodes.begin[k]
+                touchdown = now[0] + forecast.ahead[k] + forecast.by_speed[k] * now[3]
+            foot[k, 0] = touchdown
+        total = force[k] * nodes.feet[k]
+
+        def rate(s, f=total, r=foot[k]):
+            moment = (r[0] - s[0]) * f[1] - (r[1] - s[1]) * f[0]
+            return np.r_[s[3:], f[0] / m, f[1] / m - GRAVITY, moment / inertia]
+
+        k1 = rate(now)
+        k2 = rate(now + h / 2 * k1)
+        k3 = rate(now + h / 2 * k2)
+        now = now + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(now + h * k3))
+        states.append(now)
+    return np.array(states)
+
+
+@pytest.fixture(params=[(FRONT, 0.03), (REAR, 0.01)], ids=["front", "rear"])
+def moving(request, params, schedule, forecast_of):
+    """Nodes and forecast of a tilted body on its way, and forces of a plan far from the mean."""
+    nodes = nodes_at(params, schedule, *request.param)
+    x = np.array([0.3, 0.26, 0.1, 0.5, -0.3, 1.2])
+    forecast = forecast_of(nodes, x, velocity=0.4, command=0.6, contact=((0.36, 0.0), (0.2, 0.01)))
+    rng = np.random.default_rng(0)
+    standing = (np.asarray(nodes.feet) > 0)[:, None]
+    vertical = np.asarray(forecast.force_z) * rng.uniform(0.6, 1.4, COUNT)
+    force = standing * np.stack([rng.normal(size=COUNT) * 25.0, vertical], axis=1)
+    return nodes, forecast, x, force
+
+
+def test_the_roll_out_and_its_derivative_are_the_rigid_bodys(params, moving):
+    nodes, forecast, x, force = moving
+    about = jax.tree.map(np.asarray, roll_out(params, nodes, forecast, x, force))
+    # Both are exact: rounding is left, of differences over 1e-3 N too (the motion is quadratic).
+    exact = rigid_body_motion(nodes, forecast, x, force)
+    np.testing.assert_allclose(about.states, exact, atol=1e-12)
+    for j, axis in np.ndindex(COUNT, 2):
+        change = np.zeros((COUNT, 2))
+        change[j, axis] = 1e-3 * float(nodes.feet[j] > 0)
+        both = [rigid_body_motion(nodes, forecast, x, force + s * change) for s in (1, -1)]
+        slope = (both[0] - both[1]) / 2e-3
+        np.testing.assert_allclose(about.by_force[:, :, j, axis], slope, atol=1e-10)
+
+
+def test_toppling_and_next_footholds_are_predicted_when_forces_change(params, moving):
+    # The plan after a disturbance differs by a fifth from the last one. A path that does not
+    # depend on the forces misses the moments that the change makes.
+    nodes, forecast, x, force = moving
+    rng = np.random.default_rng(1)
+    errors = []
+    for _ in range(20):
+        last = force * rng.uniform(0.8, 1.2, force.shape)
+        about = jax.tree.map(np.asarray, roll_out(params, nodes, forecast, x, last))
+        here = forecast._replace(path=about.path, foot=about.foot)
+        free, forced = map(np.asarray, response(params, nodes, here, x))
+        exact = rigid_body_motion(nodes, forecast, x, force)
+        predicted = about.states + np.einsum("kajf,jf->ka", about.by_force, force - last)
+        fixed = free + np.einsum("kajf,jf->ka", forced, force)
+        np.testing.assert_allclose(predicted[:, [0, 1, 3, 4]], exact[:, [0, 1, 3, 4]], atol=1e-12)
+        errors.append([np.abs(a - exact)[-1, [2, 5]] for a in (predicted, fixed)])
+    with_arms, without = np.sqrt(np.mean(np.square(errors), axis=0))
+    # 10 to 13 times; a fifth of what changes is left to second order.
+    assert (8 * with_arms < without).all()
+
+
+def test_replanning_about_the_plan_ends_at_a_plan_that_the_rigid_body_follows(
+    params, schedule, forecast_of
+):
+    nodes = nodes_at(params, schedule, FRONT, 0.02)
+    x = np.array([0.0, 0.262, -0.08, 0.3, -0.1, -0.3])
+    forecast = forecast_of(nodes, x, velocity=0.3, command=1.0)
+    spec = CycleSpec(nodes=COUNT - 1, tolerance=1e-9, max_iterations=40)
+
+    @jax.jit
+    def run(params, robot, nodes, forecast, x, nominal):
+        lever = jnp.array([0.0, -0.018])
+        return multiphase.solve(params, robot, nodes, forecast, x, lever, spec, nominal)
+
+    nominal = np.stack([np.zeros(COUNT), np.asarray(forecast.force_z)], axis=1)
+    for _ in range(8):
+        solved = run(params, go1.PARAMS, nodes, forecast, x, nominal)
+        assert solved.status == 0
+        nominal = np.asarray(solved.force)
+    exact = rigid_body_motion(nodes, forecast, x, nominal)
+    np.testing.assert_allclose(solved.states, exact, atol=1e-5)  # what 8 plans leave
+
+
+def test_the_last_plan_is_found_again_in_later_nodes(params, schedule):
+    before = nodes_at(params, schedule, FRONT, 0.02)
+    force = np.random.default_rng(0).uniform(10.0, 90.0, (COUNT, 2))
+    force[np.asarray(before.feet) == 0] = 0.0
+    memory = cycle_rollout.CycleMemory(force=force, end=before.end)
+    later = nodes_at(params, schedule, FRONT, 0.025)
+    otherwise = np.where(later.feet > 0, 77.0, 0.0)
+    got = np.asarray(shifted(memory, later, otherwise, 0.005))
+    middle = 0.005 + later.end - 0.5 * later.length
+    for k in np.flatnonzero(later.feet > 0):
+        node = np.searchsorted(before.end, middle[k], side="right")
+        expected = force[node] if node < COUNT else [0.0, 77.0]
+        np.testing.assert_array_equal(got[k], expected)
+    np.testing.assert_array_equal(got[later.feet == 0], 0.0)
+    # Long after, nothing of it is left.
+    old = cycle_rollout.aged(memory, 1.0)
+    np.testing.assert_array_equal(shifted(old, later, otherwise, 0.005)[:, 1], otherwise)

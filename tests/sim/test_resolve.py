@@ -163,9 +163,10 @@ def test_nodes_of_a_cycle_make_another_program():
     cycle = {"gait.names": ["bound_multiphase"]}
     specs = [
         batch_spec(load_config(RunConfig, None, cycle | own))
-        for own in ({}, {"multiphase.node_dt": 0.025}, {"multiphase.tolerance": 1e-7})
-    ]
-    assert len(set(specs)) == 3
+        for own in ({}, {"multiphase.node_dt": 0.025}, {"multiphase.tolerance": 1e-7},
+                    {"multiphase.linearise": "last_plan"})
+    ]  # fmt: skip
+    assert len(set(specs)) == 4
     data = {"multiphase.friction": 0.5, "gaits.bound_multiphase.body_height": 0.6573}
     assert specs[0] == batch_spec(load_config(RunConfig, None, cycle | data))
 
