@@ -135,6 +135,12 @@ _BOUND: dict[str, Any] = {
     "foothold_rear": 0.3474,
     "foothold_gain": 0.3599,
     "swing_height": 0.1502,
+    # Pitch is the gait's own; a roll has only the time of a short stance to be stopped in.
+    "attitude": (60.0, 4.0, 30.0),
+    "position": (0.7, 0.1, 9.0),
+    "omega": (2.3, 0.5, 2.3),
+    "velocity": (15.0, 1.0, 2.0),
+    "force": 0.0781,
 }
 
 LIBRARY: dict[str, GaitConfig] = {

@@ -104,7 +104,7 @@ def test_pushes_come_from_all_sides_at_all_phases_with_one_strength():
     np.testing.assert_array_equal(turns, limits.DIRECTIONS)
     begins = np.unique([c.push.times[0] for c in configs])
     assert len(begins) == 8
-    assert begins[-1] - begins[0] < configs[0].gaits["bound"].period
+    assert begins[-1] - begins[0] < configs[0].gaits["bound_multiphase"].period
     # Seeds of one push lie side by side.
     assert [c.seed for c in configs[:4]] == [0, 1, 2, 0]
     assert configs[0].push == configs[2].push != configs[3].push
@@ -153,7 +153,7 @@ def test_phases_of_the_switches_cover_a_cycle():
     assert len(np.unique(first)) == limits.SWITCH_PHASES
     assert first.max() - first.min() == pytest.approx(0.4 * 63 / 64, abs=1e-3)
     second = np.array([c.gait.times[2] for c in configs])
-    period = configs[0].gaits["bound"].period
+    period = configs[0].gaits["bound_multiphase"].period
     assert second.max() - second.min() == pytest.approx(period * 63 / 64, abs=1e-3)
 
 

@@ -15,6 +15,8 @@ from kjax.sim.intervals import median_interval, wilson
 Row: TypeAlias = dict[str, Any]
 Done: TypeAlias = Callable[[list[RunConfig]], list[Row]]
 
+# The bound whose footholds suit a plan through flight.
+GAITS = {"trot": "trot", "flying_trot": "flying_trot", "bound": "bound_multiphase"}
 NAMES = ("commands", "grounds", "random", "pushes", "speeds", "switches", "laps", "paper")
 
 

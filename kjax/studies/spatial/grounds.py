@@ -8,6 +8,7 @@ import numpy as np
 
 from kjax.config import RunConfig
 from kjax.studies.spatial.cases import (
+    GAITS,
     Done,
     Part,
     Row,
@@ -121,10 +122,9 @@ def _grounds_table(rows: list[Row]) -> str:
 
 
 # The paper's: config, its gait here, keys besides, and what is read.
-_BOUND = {"gait.names": ["bound"]}
 _FLAT: dict[str, tuple[str, dict[str, Any]]] = {
     "trot, the paper's profile": ("trot_velocity", {"gaits.trot.period": 0.4}),
-    "bound, the paper's profile": ("bound_velocity", {}),
+    "bound, the paper's profile": ("bound_velocity", {"gait.names": [GAITS["bound"]]}),
 }
 _ROUGH: dict[str, tuple[str, dict[str, Any]]] = {
     "trot 0.3 m/s, the paper's field": ("trot_rough", {"gaits.trot.period": 0.4}),
@@ -132,7 +132,7 @@ _ROUGH: dict[str, tuple[str, dict[str, Any]]] = {
         "trot_rough",
         {"gaits.trot.period": 0.4, "command.v_x": [0.0, 0.6], "duration": 8.0},
     ),
-    "bound 0.75 m/s, the paper's field": ("bound_rough", _BOUND),
+    "bound 0.75 m/s, the paper's field": ("bound_rough", {}),
 }
 # Of the spatial controller's own settings nothing is the planar one's.
 _OWN = {

@@ -7,6 +7,7 @@ import numpy as np
 
 from kjax.config import RunConfig
 from kjax.studies.spatial.cases import (
+    GAITS,
     Done,
     Part,
     Row,
@@ -36,9 +37,14 @@ def _asked(v_x: float, yaw_rate: float = 0.0) -> dict[str, Any]:
 
 def push_configs(gait: str, impulse: float, args: SpatialOptions) -> list[RunConfig]:
     """Episodes of one strength: directions, then phases, then seeds, the last first."""
-    keys = {**_SHORT, **_asked(0.5), "gait.names": [gait], "duration": 3.0 if args.quick else 5.0}
+    keys = {
+        **_SHORT,
+        **_asked(0.5),
+        "gait.names": [GAITS[gait]],
+        "duration": 3.0 if args.quick else 5.0,
+    }
     one = base(args, keys)
-    period, out = one.gaits[gait].period, []
+    period, out = one.gaits[GAITS[gait]].period, []
     for angle in np.radians(DIRECTIONS[:1] if args.quick else DIRECTIONS):
         for phase in range(1 if args.quick else PHASES):
             begin = round(2.4 + phase * period / PHASES, 3)
@@ -123,7 +129,7 @@ def speed_configs(name: str, value: float, args: SpatialOptions) -> list[RunConf
     turns = name not in IMPULSES and name != "flying_trot"
     gait = "trot" if turns else name
     asked = _asked(0.0, value) if turns else _asked(value)
-    keys = {**_SHORT, **asked, "gait.names": [gait], "duration": 3.0 if args.quick else 7.0}
+    keys = {**_SHORT, **asked, "gait.names": [GAITS[gait]], "duration": 3.0 if args.quick else 7.0}
     one = base(args, keys)
     return [dataclasses.replace(one, seed=seed) for seed in range(args.seeds)]
 
@@ -197,13 +203,16 @@ _ROWS = (("trot", "bound", "trot"), ("trot",) * 3, ("bound",) * 3)
 
 def switch_configs(gaits: tuple[str, ...], args: SpatialOptions) -> list[RunConfig]:
     """Episodes of one order of gaits, one for each phase of the switches."""
-    one = base(args, {"gait.names": list(gaits)}, "omni_switch")
-    trot, bound = one.gaits["trot"].period, one.gaits["bound"].period
+    names = tuple(GAITS[gait] for gait in gaits)
+    one = base(args, {"gait.names": list(names)}, "omni_switch")
+    trot, bound = (one.gaits[GAITS[gait]].period for gait in ("trot", "bound"))
     out = []
     for k in range(2 if args.quick else SWITCH_PHASES):
         part = k / SWITCH_PHASES
         times = (0.0, round(3.0 + part * trot, 3), round(6.0 + part * bound, 3))
-        gait = dataclasses.replace(one.gait, names=gaits, times=times, also=("trot", "bound"))
+        gait = dataclasses.replace(
+            one.gait, names=names, times=times, also=(GAITS["trot"], GAITS["bound"])
+        )
         out.append(dataclasses.replace(one, seed=k, gait=gait))
     return out
 
