@@ -198,7 +198,7 @@ class SpatialConfig:
     """Length of the prediction, at most a gait cycle [s]."""
     node_dt: Positive = 0.025
     """Longest node where two feet stand, longer in proportion where more do [s]."""
-    attitude: Annotated[Three, COST] = (12.0, 2.0, 100.0)
+    attitude: Annotated[Three, COST] = (12.0, 10.0, 100.0)
     """Weights of the squared errors of roll, pitch and yaw [1/rad^2]."""
     position: Annotated[Three, COST, POSITION_COST] = (0.2, 0.2, 4.0)
     """Of the centre of mass's place [1/L^2]."""
@@ -206,7 +206,7 @@ class SpatialConfig:
     """Of the angular velocity [L/g]."""
     velocity: Annotated[Three, COST, VELOCITY_COST] = (12.0, 4.0, 1.0)
     """Of the centre of mass's velocity [1/(g L)]."""
-    force: Annotated[Positive, COST, INPUT_COST] = 0.3
+    force: Annotated[Positive, COST, INPUT_COST] = 0.2
     """Weight of every squared force's distance from the gait's mean force [1/(m g)^2]."""
     friction: Annotated[float, Field(ge=0.05)] = 0.6
     """mu of the friction cones, as pyramids of eight sides; below the ground's, for margin [-]."""
@@ -223,10 +223,10 @@ class SpatialConfig:
     push the way back is no faster [m/s]."""
     heading_slack: Positive = 0.3
     """Largest lead or lag of the heading's reference before the trunk [rad]."""
-    integral_gains: Annotated[Three, RATE] = (1.5, 1.5, 0.5)
+    integral_gains: Annotated[Three, RATE] = (1.0, 1.0, 0.5)
     """Rates at which the errors of velocity, ahead and to the left, and of the heading move their
     references; 0: not [1/s]."""
-    integral_limits: Three = (0.4, 0.4, 0.1)
+    integral_limits: Three = (0.4, 0.4, 0.3)
     """Largest corrections of these references [m/s, m/s, rad]."""
     velocity_time: Annotated[Positive, TIME] = 0.15
     """Time in which the velocity is predicted to reach its reference, for the next footholds

@@ -30,6 +30,7 @@ from kjax.mpc.response import PredictionTask, Targets
 from kjax.mpc.rigid_models import PREDICTIONS
 from kjax.spec import ControllerSpec, SpatialSpec
 
+BIAS = 0.25  # part of the largest correction up to which an error counts for integral action
 USABLE = 1e-2  # residual up to which a plan at the iteration limit walks better than none
 
 PlanFrom = Callable[[Tables, ControllerState, View, Array, Array], tuple[ControllerState, PlanInfo]]
@@ -197,6 +198,7 @@ def _next_motion(
     wanted = jnp.stack([command[V_X], command[V_Y], command[YAW_RATE]])
     change = control_dt * jnp.stack([params.command_slew, params.command_slew, own.slew])
     reference = state.velocity + jnp.clip(wanted - state.velocity, -change, change)
+    steady = jnp.all(reference == wanted)
     climb = params.height_slew * control_dt
     height = state.height + jnp.clip(command[HEIGHT] - state.height, -climb, climb)
     ahead = _wrapped(state.heading + reference[2] * control_dt - yaw)
@@ -209,9 +211,11 @@ def _next_motion(
     # Errors in the axes of the trunk, where what causes them stays.
     error = jnp.append(turned(-heading, -lead), ahead)
     rate, limit = own.integral
-    # Errors beyond the limit are a step on its way, not a bias.
-    correction = state.correction + rate * control_dt * jnp.clip(error, -limit, limit)
-    correction = jnp.where(switched, 0.0, jnp.clip(correction, -limit, limit))
+    # While the command is on its way, and of larger errors, it is a step that is left, not a bias.
+    most = limit * BIAS
+    learned = jnp.where(steady, rate * control_dt * jnp.clip(error, -most, most), 0.0)
+    correction = jnp.clip(state.correction + learned, -limit, limit)
+    correction = jnp.where(switched, 0.0, correction)
     lead = lead - turned(heading, correction[:2])
     slack = params.position_slack
     lag = jnp.clip(state.lag - lead * control_dt, -slack, slack)

@@ -24,7 +24,7 @@ from kjax.viz.tables import markdown_table
 _SHORT = {"gaits.trot.period": 0.4, "gaits.flying_trot.period": 0.4}
 DIRECTIONS = tuple(45.0 * k for k in range(8))  # deg, from ahead to the left
 PHASES = 8
-IMPULSES = {"trot": (10.0, 15.0, 20.0, 25.0, 30.0), "bound": (5.0, 10.0, 15.0, 20.0)}  # N s
+IMPULSES = {"trot": (15.0, 20.0, 25.0, 30.0), "bound": (10.0, 15.0, 20.0)}  # N s
 STANDS = 0.95  # part of the seeds that a push must leave standing
 
 
