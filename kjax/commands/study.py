@@ -16,12 +16,14 @@ STUDIES = {
     "learn_control": "a dictionary learned through the closed loop",
     "spatial": "in three dimensions: commands, grounds unseen, pushes, speeds, switches",
     "spatial_models": "which models of the body in three dimensions predict how far",
+    "spatial_walks": "what each of them walks like in three dimensions, tuned alike",
     "showreel": "the moving picture of the README: gaits and grounds, one after another",
 }
 _PACKAGES = {
     "whole_body": "kjax.studies.whole_body.study",
     "spatial": "kjax.studies.spatial.study",
     "spatial_models": "kjax.studies.spatial_models.study",
+    "spatial_walks": "kjax.studies.spatial_walks.study",
 }
 
 

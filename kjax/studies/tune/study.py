@@ -12,7 +12,6 @@ there as well: the same command goes on after Ctrl-C or a kill.
 
 import dataclasses
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from kjax.sim.closed_cost import recording_costs
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.resolve import batch_spec, resolve_episodes
 from kjax.sim.summary import summarise
-from kjax.studies.tune import report
+from kjax.studies.tune import evolution, report
 from kjax.studies.tune.options import DRAWN, Task, parse_task
 from kjax.tuning import loop
 from kjax.tuning.optimise import Descent, build_objective, descend
@@ -37,7 +36,6 @@ from kjax.tuning.space import Space, Variables, build_space, tuned_config
 
 TRAIN_SEED, HELD_OUT_SEED = 100, 200  # the reported MuJoCo seeds are 0 to 15
 POPULATION_SEEDS = 4  # MuJoCo episodes per candidate of the baseline
-SIGMA = 0.5  # of a first population, about a factor of 1.6
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,7 +59,7 @@ def tune(config: RunConfig, args: Task, folder: Path) -> None:
     except ValueError as error:
         fail(f"--{error}" if str(error).startswith("keys") else str(error))
     begin = worsened(space, args.worsen, args.worsen_seed)
-    cache = open_cache(folder, Path(__file__))
+    cache = open_cache(folder, Path(__file__), Path(evolution.__file__))
     key = cache.key(short, _settings(args))
     cache.folder.mkdir(exist_ok=True)
     train, held_out = (
@@ -191,13 +189,7 @@ def evolve(
     config: RunConfig, space: Space, begin: Variables, args: Task, seconds: float,
     cache: Cache, key: str,
 ) -> dict[str, Any]:  # fmt: skip
-    """CMA-ES on batches of MuJoCo episodes for some wall time [s]; kept after every generation.
-
-    What is kept is the costs and times of the generations: the search draws the same candidates
-    from the same seed, and is told again what they cost.
-    """
-    import cma
-
+    """CMA-ES on batches of MuJoCo episodes for some wall time [s]; kept after every generation."""
     leaves, tree = jax.tree.flatten(begin)
     sizes = np.cumsum([np.size(leaf) for leaf in leaves])[:-1]
 
@@ -206,43 +198,28 @@ def evolve(
         shaped = [p.reshape(np.shape(a)) for p, a in zip(parts, leaves, strict=True)]
         return space.inside(jax.tree.unflatten(tree, shaped))
 
-    mean = np.concatenate([np.ravel(leaf) for leaf in leaves])
-    search = cma.CMAEvolutionStrategy(mean, SIGMA, {"seed": 1, "verbose": -9})
-    costs: list[np.ndarray] = []
-    spent: list[float] = []
-    kept = cache.arrays(key)
-    if kept is not None:
-        for row, seconds_of_it in zip(kept["costs"], kept["seconds"], strict=True):
-            search.tell(search.ask(), row.tolist())
-            costs.append(row)
-            spent.append(float(seconds_of_it))
     scenarios = mujoco_scenarios(config, args)
     engine = BatchEngine(batch_spec(scenarios[0]), torques="held")
-    with tqdm(total=round(seconds), unit="s", desc="CMA-ES", disable=None) as bar:
-        while sum(spent) < seconds and not search.stop():
-            clock = time.perf_counter()
-            asked = search.ask()
-            candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
-            recording = engine.run(resolve_episodes([
-                dataclasses.replace(c, command=w.command, seed=w.seed, sim=w.sim)
-                for c in candidates for w in scenarios
-            ]))  # fmt: skip
-            if recording.interrupted:
-                raise KeyboardInterrupt
-            row = recording_costs(recording).reshape(len(asked), len(scenarios)).mean(axis=1)
-            search.tell(asked, row.tolist())
-            costs.append(row)
-            spent.append(time.perf_counter() - clock)
-            cache.add_arrays(key, {"costs": np.stack(costs), "seconds": np.array(spent)})
-            bar.n = min(round(sum(spent)), bar.total)
-            bar.set_postfix_str(f"cost {min(one.min() for one in costs):.3f}")
+
+    def cost(asked: Sequence[np.ndarray]) -> np.ndarray:
+        candidates = [tuned_config(config, space.overrides(unflat(one))) for one in asked]
+        recording = engine.run(resolve_episodes([
+            dataclasses.replace(c, command=w.command, seed=w.seed, sim=w.sim)
+            for c in candidates for w in scenarios
+        ]))  # fmt: skip
+        if recording.interrupted:
+            raise KeyboardInterrupt
+        return recording_costs(recording).reshape(len(asked), len(scenarios)).mean(axis=1)
+
+    mean = np.concatenate([np.ravel(leaf) for leaf in leaves])
+    found = evolution.evolve(cost, mean, cache=cache, key=key, seconds=seconds)
     return {
-        "best": unflat(search.result.xfavorite if costs else mean),
-        "generations": len(costs),
-        "population": search.popsize,
-        "episodes": len(costs) * search.popsize * len(scenarios),
-        "seconds": sum(spent),
-        "cost": [float(one.min()) for one in costs],
+        "best": unflat(found.favourite),
+        "generations": len(found.costs),
+        "population": found.population,
+        "episodes": found.costs.size * len(scenarios),
+        "seconds": float(found.seconds.sum()),
+        "cost": found.costs.min(axis=1).tolist(),
     }
 
 

@@ -1,0 +1,1 @@
+"""What a better prediction in three dimensions buys in closed loop."""
