@@ -13,6 +13,7 @@ NOTEBOOKS = (
     "3_residual_models",
     "4_your_own_simulator",
     "5_tuning_through_the_loop",
+    "6_three_dimensions",
 )
 
 

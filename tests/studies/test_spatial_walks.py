@@ -49,7 +49,7 @@ def walks(monkeypatch):
             return SimpleNamespace(interrupted=is_over, trajectory=lambda robot: None)
 
     def run(cache, configs, *, torques, dtype, measure, **more):
-        assert len({batch_spec(config) for config in configs}) == 1
+        assert len({(batch_spec(config), config.duration) for config in configs}) == 1
         keys = [batch_key(cache, config, torques, dtype, measure) for config in configs]
         for key, config in zip(keys, configs, strict=True):
             if key not in cache:

@@ -24,6 +24,7 @@ THROWN = {  # 1 sigma of the start; of roll there is no such key
 # Errors that cost 1: of v_x, v_y [m/s], of the yaw rate over a cycle [rad/s], of roll, pitch [deg].
 UNIT = np.array([0.02, 0.02, 0.02, 1.0, 1.0])
 FALL = 1000.0
+DURATION = 3.5  # s, of what is reported: one batch has one duration
 
 
 @dataclass(kw_only=True)
@@ -89,15 +90,15 @@ def tuning_configs(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
 
 
 def _steady(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
-    return with_seeds([walk_config(model, one, 4.0) for one in STEADY], range(args.seeds))
+    return with_seeds([walk_config(model, one, DURATION) for one in STEADY], range(args.seeds))
 
 
 def _turning(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
-    return with_seeds([walk_config(model, (1.0, 0.0, 2.5), 4.0)], range(args.seeds))
+    return with_seeds([walk_config(model, (1.0, 0.0, 2.5), DURATION)], range(args.seeds))
 
 
 def _pushed(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
-    one = walk_config(model, (0.5, 0.0, 0.0), 3.5)
+    one = walk_config(model, (0.5, 0.0, 0.0), DURATION)
     period, out = one.gaits[one.gait.names[0]].period, []
     for forward, lateral in ((IMPULSE, 0.0), (0.0, IMPULSE)):
         for phase in range(1 if args.quick else PHASES):
@@ -110,17 +111,17 @@ def _pushed(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
 
 
 def _thrown(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
-    return with_seeds([walk_config(model, (0.5, 0.0, 0.0), 3.0, THROWN)], range(args.seeds))
+    return with_seeds([walk_config(model, (0.5, 0.0, 0.0), DURATION, THROWN)], range(args.seeds))
 
 
 def _bound(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
-    one = walk_config(model, (0.6, 0.0, 0.0), 4.0, name="omni_bound")
+    one = walk_config(model, (0.6, 0.0, 0.0), DURATION, name="omni_bound")
     return with_seeds([one], range(args.seeds))
 
 
 def _long(model: str, args: SpatialWalksOptions) -> list[RunConfig]:
     keys = {"spatial.horizon": 0.4, "gaits.trot.period": 0.4}
-    return with_seeds([walk_config(model, STEADY[-1], 4.0, keys)], range(args.seeds))
+    return with_seeds([walk_config(model, STEADY[-1], DURATION, keys)], range(args.seeds))
 
 
 @dataclass(frozen=True, kw_only=True)
