@@ -381,6 +381,7 @@ for _name in (
     "spatial",
     "spatial_mjx",
     "spatial_models",
+    "spatial_walks",
 ):
     table(_as_left(_name))
 

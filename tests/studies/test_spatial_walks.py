@@ -188,6 +188,6 @@ def test_the_title_names_a_model_only_where_its_interval_is_its_own():
 
     record = {"cases": ["steady"], "models": {"momentum": entry(1, 0.9, 1.1),
                                               "convex": entry(3, 2.0, 4.0)}}  # fmt: skip
-    assert report.title(record) == "momentum costs least: steady commands"
+    assert report.title(record) == "Tuned alike, momentum costs least: steady commands"
     record["models"]["present"] = entry(1.05, 1.0, 1.2)
-    assert report.title(record) == "no model is clearly best: steady commands"
+    assert report.title(record) == "No model is clearly best: steady commands"

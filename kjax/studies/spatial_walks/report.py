@@ -83,7 +83,7 @@ def _disturbed(record: Row, names: Sequence[str]) -> str:
 def figure(record: Row, path: Path) -> None:
     """Each case with every model: what it costs, or the largest tilt; falls beside it."""
     names, models = record["cases"], list(record["models"])
-    columns = min(3, len(names))
+    columns = min(3 if len(names) > 4 else 2, len(names))
     lines = -(-len(names) // columns)
     fig, axes = plt.subplots(
         lines, columns, figsize=(1.4 + 2.7 * columns, 0.9 + 0.35 * lines * (2 + len(models))),
@@ -94,7 +94,7 @@ def figure(record: Row, path: Path) -> None:
     for ax in axes.flat[len(names) :]:
         ax.set_axis_off()
     axes[0, 0].set_yticks(range(len(models)), models)
-    axes[0, 0].invert_yaxis()
+    axes[0, 0].set_ylim(len(models) - 0.5, -0.5)
     fig.suptitle(title(record))
     handles, labels = axes[0, 0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside lower center", ncols=2)
@@ -125,8 +125,8 @@ def _draw(ax: Any, record: Row, name: str) -> None:
 
 def title(record: Row) -> str:
     """The finding: which tuned model is the cheapest where, and whether its interval is its own."""
-    clear: list[tuple[str, str]] = []
-    close: list[tuple[str, str]] = []
+    best: dict[str, list[str]] = {}
+    close: list[str] = []
     for name in record["cases"]:
         found = {
             model: entry["tuned"][name] for model, entry in record["models"].items()
@@ -137,8 +137,8 @@ def title(record: Row) -> str:
         first, *rest = sorted(found, key=lambda model: found[model]["cost"])
         intervals = [found[model]["cost_interval"] for model in (first, *rest)]
         is_apart = all(intervals) and all(one[0] > intervals[0][1] for one in intervals[1:])
-        (clear if is_apart else close).append((CASES[name].title, first))
-    said = [f"{model} costs least: {case}" for case, model in clear]
+        (best.setdefault(first, []) if is_apart else close).append(CASES[name].title)
+    said = [f"Tuned alike, {model} costs least: {'; '.join(won)}" for model, won in best.items()]
     if close:
-        said.append("no model is clearly best: " + "; ".join(case for case, _ in close))
+        said.append("No model is clearly best: " + "; ".join(close))
     return "\n".join(said) or "Tuned and shipped weights"
