@@ -198,13 +198,13 @@ class SpatialConfig:
     """Length of the prediction, at most a gait cycle [s]."""
     node_dt: Positive = 0.025
     """Longest node where two feet stand, longer in proportion where more do [s]."""
-    attitude: Annotated[Three, COST] = (12.0, 10.0, 100.0)
+    attitude: Annotated[Three, COST] = (25.0, 20.0, 100.0)
     """Weights of the squared errors of roll, pitch and yaw [1/rad^2]."""
-    position: Annotated[Three, COST, POSITION_COST] = (0.2, 0.2, 4.0)
+    position: Annotated[Three, COST, POSITION_COST] = (0.2, 0.2, 9.0)
     """Of the centre of mass's place [1/L^2]."""
-    omega: Annotated[Three, COST, OMEGA_COST] = (0.1, 0.1, 1.0)
+    omega: Annotated[Three, COST, OMEGA_COST] = (1.0, 1.0, 1.0)
     """Of the angular velocity [L/g]."""
-    velocity: Annotated[Three, COST, VELOCITY_COST] = (12.0, 4.0, 1.0)
+    velocity: Annotated[Three, COST, VELOCITY_COST] = (12.0, 4.0, 2.0)
     """Of the centre of mass's velocity [1/(g L)]."""
     force: Annotated[Positive, COST, INPUT_COST] = 0.2
     """Weight of every squared force's distance from the gait's mean force [1/(m g)^2]."""
