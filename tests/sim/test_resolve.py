@@ -41,6 +41,11 @@ VALUES = {
             "grf_z_max": 2.3,
             "foothold_gain": 0.24,
             "swing_height": 0.164,
+            "attitude": [20.0, 10.0, 15.0],
+            "position": [0.5, 0.5, 5.0],
+            "omega": [1.0, 2.0, 3.0],
+            "velocity": [3.0, 4.0, 2.0],
+            "force": 0.1,
         }.items()
     },
     "lmpc.control_dt": 0.01,
