@@ -87,16 +87,16 @@ def _learned(own: InSi, robot: RobotParams, mass: Any, inertia: Any) -> so3.So3M
     """What EDMD finds of the rigid body, NumPy in float64; ``None`` for the other models."""
     if own.model not in LEARNED:
         return None
-    numbers = tuple(np.asarray(a, float).tobytes() for a in (mass, inertia, footholds(robot)))
-    return _fit(numbers, LEARNED[own.model], own.snapshots, own.training_seed, own.node_dt / 2)
+    body = tuple(np.asarray(a, float).tobytes() for a in (mass, inertia, footholds(robot)))
+    return _fit(body, LEARNED[own.model], own.snapshots, own.training_seed, own.node_dt / 2)
 
 
 @lru_cache(maxsize=16)
 def _fit(
-    numbers: tuple[bytes, ...], bilinear: bool, snapshots: int, seed: int, dt: float
+    of_body: tuple[bytes, ...], bilinear: bool, snapshots: int, seed: int, dt: float
 ) -> so3.So3Model:
     """The fit of one body and its footholds, from their bytes."""
-    mass, inertia, feet = (np.frombuffer(one) for one in numbers)
+    mass, inertia, feet = (np.frombuffer(one) for one in of_body)
     with jax.enable_x64(True):
         body = SpatialBody(jnp.asarray(mass[0]), jnp.asarray(inertia.reshape(3, 3)))
         data = spatial_data.draw(

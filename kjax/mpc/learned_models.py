@@ -80,13 +80,13 @@ def _outputs(
     """State of a lifted one in the world's axes (no momentum yet), and how both change."""
     R = so3.nearest_rotation(z[so3.ROTATION].reshape(3, 3))
 
-    def turn(entries: Array) -> Array:
+    def rotation_from(entries: Array) -> Array:
         """Turn from R to the rotation nearest to others, to first order."""
         D = so3.nearest_rotation(entries.reshape(3, 3)) @ R.T
         return 0.5 * jnp.stack([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
 
     outputs = jnp.zeros((12, so3.SIZE), z.dtype)
-    outputs = outputs.at[:3, so3.ROTATION].set(Rz @ jax.jacfwd(turn)(z[so3.ROTATION]))
+    outputs = outputs.at[:3, so3.ROTATION].set(Rz @ jax.jacfwd(rotation_from)(z[so3.ROTATION]))
     outputs = outputs.at[3:6, so3.P].set(Rz).at[6:9, so3.OMEGA].set(Rz).at[9:, so3.V].set(Rz)
     p, v = Rz @ z[so3.P], Rz @ z[so3.V]
     return BodyState(p=p, R=Rz @ R, v=v, L=jnp.zeros_like(p)), outputs
