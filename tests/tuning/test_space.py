@@ -27,7 +27,7 @@ def test_the_variables_of_a_config_give_its_own_parameters():
 
 def test_every_kind_of_number_exists_in_the_config_and_comes_back():
     free = [key for key in TUNABLE if not key.startswith("srb.") and value(BOUND, key) is not None]
-    assert sum(key.startswith("gaits.bound.") for key in free) == 10
+    assert sum(key.startswith("gaits.bound.") for key in free) == 15
     space = build_space(BOUND, free)
     tuned = tuned_config(BOUND, space.overrides(space.start))
     for key in free:

@@ -124,6 +124,8 @@ def tilted(angle, axis):
     return rotations.exp(jnp.asarray(angle)[:, None] * jnp.eye(3)[axis])
 
 
-def test_no_force_comes_near_the_friction_cone(runs):
+def test_forces_keep_to_the_plans_pyramid(runs):
+    """Its corners lie at 1 / cos(pi / 8) times the friction that is planned with."""
     force = runs.trace.force[runs.trace.stance]
-    assert (np.hypot(force[:, 0], force[:, 1]) < 0.59 * force[:, 2]).all()
+    most = 0.6 / np.cos(np.pi / 8)
+    assert (np.hypot(force[:, 0], force[:, 1]) < (most + 1e-3) * force[:, 2]).all()
