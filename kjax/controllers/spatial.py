@@ -30,7 +30,7 @@ from kjax.mpc.response import PredictionTask, Targets
 from kjax.mpc.rigid_models import PREDICTIONS
 from kjax.spec import ControllerSpec, SpatialSpec
 
-BIAS = 0.25  # part of the largest correction up to which an error counts for integral action
+ERROR_CLIP = 0.25  # of integral action (anti-windup), part of its largest correction
 USABLE = 1e-2  # residual up to which a plan at the iteration limit walks better than none
 
 PlanFrom = Callable[[Tables, ControllerState, View, Array, Array], tuple[ControllerState, PlanInfo]]
@@ -212,7 +212,7 @@ def _next_motion(
     error = jnp.append(turned(-heading, -lead), ahead)
     rate, limit = own.integral
     # While the command is on its way, and of larger errors, it is a step that is left, not a bias.
-    most = limit * BIAS
+    most = ERROR_CLIP * limit
     learned = jnp.where(steady, rate * control_dt * jnp.clip(error, -most, most), 0.0)
     correction = jnp.clip(state.correction + learned, -limit, limit)
     correction = jnp.where(switched, 0.0, correction)

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from kjax.mpc.grid import node_at
 from kjax.mpc.horizon import HorizonForecast, MultiPhaseParams, Nodes
 from kjax.types import GRAVITY
 
@@ -81,10 +82,9 @@ def shifted(
       otherwise: (K,) vertical force of feet that pressed nothing then, and beyond its end [N].
       passed: time since the last tick [s].
     """
-    node = jnp.sum((passed + nodes.middle)[:, None] >= memory.end[None], axis=1)
-    count = memory.end.shape[0]
-    force = memory.force[jnp.minimum(node, count - 1)]
-    known = (node < count) & (force[:, 1] != 0.0)
+    node, within = node_at(memory.end, passed + nodes.middle)
+    force = memory.force[node]
+    known = within & (force[:, 1] != 0.0)
     vertical = jnp.stack([jnp.zeros_like(otherwise), otherwise], axis=-1)
     return jnp.where(known[:, None], force, vertical) * (nodes.feet > 0)[:, None]
 

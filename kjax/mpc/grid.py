@@ -49,6 +49,20 @@ class FootNodes(NamedTuple):
     used: Bool[Array, "F"]
 
 
+def node_at(
+    end: Float[Array, "K"], time: Float[Array, "n"]
+) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
+    """Node that holds at each time, and whether there is one; beyond the last, that one.
+
+    Args:
+      end: of the nodes [s].
+      time: from the same moment [s].
+    """
+    node = jnp.sum(time[:, None] >= end[None], axis=1)
+    last = end.shape[0] - 1
+    return jnp.minimum(node, last), node <= last
+
+
 def build_grid(
     schedule: gait.Schedule,
     clock: gait.Clock,

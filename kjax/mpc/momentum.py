@@ -24,7 +24,7 @@ from kjax import qp
 from kjax.dynamics import rotations, srb_spatial
 from kjax.dynamics.rotations import skew
 from kjax.dynamics.srb_spatial import BodyState, Contacts, SpatialBody
-from kjax.mpc.grid import FootNodes, Grid
+from kjax.mpc.grid import FootNodes, Grid, node_at
 from kjax.mpc.response import STATE, Response, Targets
 
 # Of the pyramid in place of the friction cone. At a corner it allows 1 / cos(pi / SIDES) times the
@@ -200,10 +200,8 @@ def shifted(
       otherwise: forces of legs that pressed nothing then, and beyond the plan's end [N].
       passed: time since the plan [s].
     """
-    middle = passed + grid.end - 0.5 * grid.length
-    node = jnp.sum(middle[:, None] >= memory.end[None], axis=1)
-    within = node < memory.end.shape[0]
-    force = memory.force[jnp.minimum(node, memory.end.shape[0] - 1)]
+    node, within = node_at(memory.end, passed + grid.end - 0.5 * grid.length)
+    force = memory.force[node]
     known = (within & memory.planned)[:, None] & (force[..., 2] != 0.0)
     force = jnp.where(known[..., None], force, otherwise)
     return jnp.where(grid.stance[..., None], force, 0.0)

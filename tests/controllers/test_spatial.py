@@ -77,6 +77,32 @@ def test_after_a_push_the_reference_is_no_further_ahead_than_its_slack(spatial, 
         assert np.isfinite(planned.force).all()
 
 
+def test_integral_action_does_not_wind_up_in_a_step(spatial, tables):
+    seen = disturbed(0, scale=0.0)._replace(contact=jnp.ones(4, bool))
+    still = with_params(tables, command=tables.params.command.hold())
+    rate, limit = np.asarray(tables.params.spatial.integral)[:, 0]
+    for speed, counts in ((0.05, 0.05), (1.0, 0.25 * limit)):
+        moving = seen._replace(base_vel=jnp.asarray([speed, 0.0, 0.0]))
+        state = spatial.init(still, moving)
+        there, _ = spatial.plan(still, state._replace(velocity=jnp.zeros(3)), moving)
+        np.testing.assert_allclose(
+            np.asarray(there.correction)[0], -0.005 * rate * counts, rtol=0.05
+        )
+        left = state._replace(velocity=jnp.asarray([1.0, 0.0, 0.0]))  # on its way to standing
+        coming, _ = spatial.plan(still, left, moving)
+        assert not np.asarray(coming.correction).any()
+
+
+def test_a_gaits_own_weights_go_before_the_others():
+    own = {
+        "controller": "spatial", "sim.base": "free", "gait.names": ["trot", "bound"],
+        "gait.times": [0.0, 1.0], "gait.also": [],
+        "gaits.bound.attitude": [1.0, 2.0, 3.0], "spatial.attitude": [4.0, 5.0, 6.0],
+    }  # fmt: skip
+    _, params = resolve(load_config(RunConfig, None, own))
+    np.testing.assert_array_equal(params.spatial.weights.attitude, [[4, 5, 6], [1, 2, 3]])
+
+
 def test_standing_feet_carry_the_weight_and_undo_what_the_body_does(spatial, tables):
     seen = disturbed(0, scale=0.0)._replace(contact=jnp.ones(4, bool))
     still = with_params(tables, command=tables.params.command.hold())
