@@ -9,7 +9,7 @@ from kjax.prediction.storage import resolve
 from kjax.robots import get_robot
 
 # Config keys that name a file whose content a result depends on.
-FILE_KEYS = ("koopman.file",)
+FILE_KEYS = ("koopman.file", "spatial.file")
 
 
 def file_hashes(config: Any) -> dict[str, str]:

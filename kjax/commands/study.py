@@ -17,6 +17,7 @@ STUDIES = {
     "spatial": "in three dimensions: commands, grounds unseen, pushes, speeds, switches",
     "spatial_models": "which models of the body in three dimensions predict how far",
     "spatial_walks": "what each of them walks like in three dimensions, tuned alike",
+    "spatial_residual": "what the rigid body in three dimensions misses of the whole robot",
     "showreel": "the moving picture of the README: gaits and grounds, one after another",
 }
 _PACKAGES = {
@@ -24,6 +25,7 @@ _PACKAGES = {
     "spatial": "kjax.studies.spatial.study",
     "spatial_models": "kjax.studies.spatial_models.study",
     "spatial_walks": "kjax.studies.spatial_walks.study",
+    "spatial_residual": "kjax.studies.spatial_residual.study",
 }
 
 
@@ -34,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help"):
         print("usage: kjax study NAME [options]\n")
-        print("\n".join(f"  {name:14} {text}" for name, text in STUDIES.items()))
+        print("\n".join(f"  {name:16} {text}" for name, text in STUDIES.items()))
         print("\n  module:main    a study of your own; its folder in PYTHONPATH")
         return 0
     name, called = words[0], f"kjax study {words[0]}"

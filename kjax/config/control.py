@@ -186,10 +186,12 @@ class SpatialConfig:
     Weights are per second of the horizon, of errors ahead, to the left and up.
     """
 
-    model: Literal["momentum", "convex", "present", "edmd", "bilinear"] = "momentum"
+    model: Literal["momentum", "convex", "present", "edmd", "bilinear", "residual"] = "momentum"
     """What predicts: exact momentum about the last plan's roll-out; Di Carlo's convex model; the
-    rigid body linearised where the robot is; or EDMD on SO(3) observables, linear or bilinear
-    [-]."""
+    rigid body linearised where the robot is; EDMD on SO(3) observables, linear or bilinear; or the
+    momentum with a residual from the whole robot's episodes [-]."""
+    file: str = ""
+    """Fitted residual (.npz), of `kjax study spatial_residual`; for model = "residual" [-]."""
     snapshots: Annotated[int, Field(ge=100)] = 4000
     """Steps that EDMD learns from, where the model is a learned one [-]."""
     training_seed: Annotated[int, Field(ge=0)] = 0
@@ -241,6 +243,14 @@ class SpatialConfig:
     """Relative residuals and gap at which the QP counts as solved [-]."""
     max_iterations: Count = 200
     """Iteration limit of the QP [-]."""
+
+    @model_validator(mode="after")
+    def _check_file(self) -> "SpatialConfig":
+        if self.model == "residual" and not self.file:
+            raise ValueError("file must name a fitted residual for model = 'residual', got ''")
+        if self.file and self.model != "residual":
+            raise ValueError(f"file: model = '{self.model}' takes no file, got '{self.file}'")
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

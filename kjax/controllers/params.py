@@ -18,6 +18,7 @@ from kjax.mpc import horizon, momentum
 from kjax.mpc.lmpc import LmpcTables, ModeSettings, build_tables
 from kjax.precision import full_precision
 from kjax.prediction.build import Prediction
+from kjax.prediction.residual_wrench import ResidualWrench
 from kjax.spec import ControllerSpec
 from kjax.types import Command, RobotParams
 
@@ -55,7 +56,7 @@ class SpatialParams(NamedTuple):
         [m/s, m/s, rad].
       slope_time: in which the slope of the ground is filtered [s].
       alignment: part of that slope that the trunk takes [-].
-      learned: what EDMD has found, where the model is a learned one.
+      learned: what was found from data, where the model is a learned one.
     """
 
     body: SpatialBody
@@ -70,7 +71,7 @@ class SpatialParams(NamedTuple):
     integral: Float[Array, "2 3"]
     slope_time: Float[Array, ""]
     alignment: Float[Array, ""]
-    learned: So3Model | None = None
+    learned: So3Model | ResidualWrench | None = None
 
 
 class ControllerParams(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 
 from kjax import gait
 from kjax.concrete import array_library, stacked
-from kjax.config import SpatialConfig
+from kjax.config import ConfigError, SpatialConfig
 from kjax.config.gaits import SPATIAL_WEIGHTS, gait_setting
 from kjax.config.units import InSi
 from kjax.controllers.params import SpatialParams
@@ -21,6 +21,8 @@ from kjax.dynamics.spatial_data import footholds
 from kjax.dynamics.srb_spatial import SpatialBody
 from kjax.koopman import so3
 from kjax.mpc import momentum
+from kjax.prediction import residual_wrench
+from kjax.prediction.residual_wrench import ResidualWrench
 from kjax.spec import SpatialSpec
 from kjax.types import RobotParams
 
@@ -83,8 +85,18 @@ def spatial_params(gaits: list[gait.Gait], config: InSi, robot: RobotParams) -> 
 LEARNED = {"edmd": False, "bilinear": True}  # names of the models, and whether they are bilinear
 
 
-def _learned(own: InSi, robot: RobotParams, mass: Any, inertia: Any) -> so3.So3Model | None:
-    """What EDMD finds of the rigid body, NumPy in float64; ``None`` for the other models."""
+def _learned(
+    own: InSi, robot: RobotParams, mass: Any, inertia: Any
+) -> so3.So3Model | ResidualWrench | None:
+    """What was found from data, NumPy in float64; ``None`` for the other models.
+
+    EDMD's is of the rigid body, a residual lies in its file.
+    """
+    if own.model == "residual":
+        try:
+            return residual_wrench.load(own.file)
+        except ValueError as error:
+            raise ConfigError(f"spatial.{error}") from None
     if own.model not in LEARNED:
         return None
     body = tuple(np.asarray(a, float).tobytes() for a in (mass, inertia, footholds(robot)))

@@ -130,8 +130,12 @@ def build_spatial_plan(spec: ControllerSpec) -> PlanFrom:
             params, clock, nodes, motion, touching - origin[None], com, slope.slope
         )
         nominal = momentum.shifted(state.memory, nodes, targets.force, control_dt)
+        lasts = params.schedule.duration[clock.gait, nodes.phase]
+        over = (nodes.end - 0.5 * nodes.length - nodes.begin) / jnp.where(lasts > 0, lasts, 1.0)
         response = predict(
-            PredictionTask(own.body, start, nodes.length, contacts, nominal, targets, own.learned)
+            PredictionTask(
+                own.body, start, nodes.length, contacts, nominal, targets, own.learned, over
+            )
         )
         torques = _torque_maps(params, response.states, contacts, com)
         solved = momentum.solve(

@@ -51,10 +51,13 @@ class Contacts(NamedTuple):
     Attributes:
       feet: (n, 3) contact points, world [m].
       force: (n, 3) force of each on the robot, world [N]; 0 for a foot in the air.
+      other: (2, 3) force at the centre of mass and moment about it of anything else, world
+        [N, N m]; ``None`` for nothing.
     """
 
     feet: Float[Array, "n 3"]
     force: Float[Array, "n 3"]
+    other: Float[Array, "2 3"] | None = None
 
 
 def gravity(dtype: jnp.dtype) -> Float[Array, "3"]:
@@ -85,6 +88,9 @@ def translation(
     a = gravity(p.dtype) + total / body.mass
     # L' = sum r_i x F_i - p(t) x sum F_i, and the integral of p is known.
     arms = jnp.cross(contacts.feet, contacts.force).sum(axis=0)
+    if contacts.other is not None:
+        a = a + contacts.other[0] / body.mass
+        arms = arms + contacts.other[1]
     path = p * t + v * (t**2 / 2) + a * (t**3 / 6)
     L = state.L + t * arms - jnp.cross(path, total)
     return p + v * t + a * (t**2 / 2), v + a * t, L

@@ -33,7 +33,7 @@ def bilinear(task: PredictionTask) -> Response:
 def _predict(task: PredictionTask, *, bilinear: bool) -> Response:
     """Roll out, and linearise along the way."""
     model = task.learned
-    assert model is not None
+    assert isinstance(model, so3.So3Model)
     c, s = task.targets.heading[0]
     zero = jnp.zeros_like(c)
     Rz = jnp.stack(

@@ -130,12 +130,14 @@ def linearise(
     now, then = (
         jax.tree.map(lambda a, s=s: a[s], states) for s in (slice(None, -1), slice(1, None))
     )
-    A, B = jax.vmap(_node, (None, 0, 0, 0, 0, 0))(body, now, then, length, feet, nominal)
-    omega, outputs = jax.vmap(_outputs, (None, 0))(body, then)
+    A, B, _ = jax.vmap(node_response, (None, 0, 0, 0, 0))(
+        body, now, then, length, Contacts(feet, nominal)
+    )
+    omega, outputs = jax.vmap(read_outputs, (None, 0))(body, then)
     return Response(states, omega, A, B, outputs)
 
 
-def _outputs(
+def read_outputs(
     body: SpatialBody, state: BodyState
 ) -> tuple[Float[Array, "3"], Float[Array, "12 12"]]:
     """Angular velocity of a state; attitude, place, angular velocity and velocity by x."""
@@ -146,18 +148,29 @@ def _outputs(
     return omega, outputs.at[6:9, :3].set(turning).at[6:9, 6:9].set(W)
 
 
-def _node(
+def node_response(
     body: SpatialBody,
     now: BodyState,
     then: BodyState,
     h: Float[Array, ""],
-    feet: Float[Array, "4 3"],
-    nominal: Float[Array, "4 3"],
-) -> tuple[Float[Array, "12 12"], Float[Array, "4 12 3"]]:
-    """A and B of one node: exact but for d, which is by the implicit midpoint rule."""
-    m, total = body.mass, nominal.sum(axis=0)
+    contacts: Contacts,
+) -> tuple[Float[Array, "12 12"], Float[Array, "4 12 3"], Float[Array, "2 12 3"]]:
+    """A and B of one node, and the response to another force at the centre of mass and moment.
+
+    Exact but for d, which is by the implicit midpoint rule.
+
+    Args:
+      body: mass and inertia.
+      now: nominal state.
+      then: the same at the node's end.
+      h: length of the node [s].
+      contacts: in the node, with nominal forces.
+    """
+    m, total = body.mass, contacts.force.sum(axis=0)
     eye, zero = jnp.eye(3, dtype=h.dtype), jnp.zeros((3, 3), h.dtype)
     a = srb_spatial.gravity(h.dtype) + total / m
+    if contacts.other is not None:
+        a = a + contacts.other[0] / m
     mean = now.p + h / 2 * now.v + h**2 / 6 * a  # of the path over the node
     pull = h * skew(total)
     R_mid = rotations.exp(h / 2 * srb_spatial.angular_velocity(body, now.R, now.L)) @ now.R
@@ -179,11 +192,14 @@ def _node(
             jnp.concatenate([zero, zero, zero, eye], axis=1),
         ]
     )
-    L_by_foot = h * skew(feet - mean[None]) + (h**2 / (6 * m) * pull)[None]
+    L_by_force = h**2 / (6 * m) * pull  # at the centre of mass
+    L_by_foot = h * skew(contacts.feet - mean[None]) + L_by_force[None]
     place = jnp.broadcast_to(h**2 / (2 * m) * eye, (4, 3, 3))
     speed = jnp.broadcast_to(h / m * eye, (4, 3, 3))
     B = jnp.concatenate([by_L[None] @ L_by_foot, place, L_by_foot, speed], axis=1)
-    return A, B
+    by_force = jnp.concatenate([by_L @ L_by_force, place[0], L_by_force, speed[0]])
+    by_moment = jnp.concatenate([h * by_L, zero, h * eye, zero])
+    return A, B, jnp.stack([by_force, by_moment])
 
 
 def shifted(

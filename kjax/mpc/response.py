@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from kjax.dynamics.srb_spatial import BodyState, SpatialBody
 from kjax.koopman.so3 import So3Model
+from kjax.prediction.residual_wrench import ResidualWrench
 
 STATE = 12  # errors that the cost weighs: attitude, place, angular velocity, velocity
 
@@ -60,7 +61,8 @@ class PredictionTask(NamedTuple):
       feet: (K, 4, 3) contact points of each leg in each node [m].
       nominal: (K, 4, 3) forces that the prediction is made about, 0 in the air [N].
       targets: at the nodes' ends.
-      learned: what EDMD has found, of the models that are learned.
+      learned: what was found from data, of the models that are learned.
+      phase: (K,) part of the gait's phase that is over in the node's middle, for a residual [-].
     """
 
     body: SpatialBody
@@ -69,7 +71,8 @@ class PredictionTask(NamedTuple):
     feet: Float[Array, "K 4 3"]
     nominal: Float[Array, "K 4 3"]
     targets: Targets
-    learned: So3Model | None = None
+    learned: So3Model | ResidualWrench | None = None
+    phase: Float[Array, "K"] | None = None
 
 
 Prediction = Callable[[PredictionTask], Response]

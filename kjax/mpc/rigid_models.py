@@ -8,7 +8,8 @@ Control (2018). Small roll and pitch, no gyroscopic term, levers from the refere
 ``present``: the rigid body linearised in state and forces where the robot is, held over the
 horizon.
 
-``edmd``, ``bilinear``: learned ones, see ``mpc.learned_models``.
+``edmd``, ``bilinear``: learned ones, see ``mpc.learned_models``. ``residual``: the momentum form
+with what was learned from the whole robot, see ``mpc.residual_model``.
 """
 
 import jax
@@ -18,14 +19,14 @@ from jaxtyping import Array, Float
 from kjax.dynamics import rotations, srb_spatial
 from kjax.dynamics.rotations import skew
 from kjax.dynamics.srb_spatial import BodyState
-from kjax.mpc import learned_models
+from kjax.mpc import learned_models, residual_model
 from kjax.mpc.momentum import linearise
 from kjax.mpc.response import STATE, Prediction, PredictionTask, Response
 
 
 def convex(task: PredictionTask) -> Response:
     """Di Carlo's model, levers and yaw of the targets."""
-    body, start, length, feet, nominal, targets, _ = task
+    body, start, length, feet, nominal, targets, *_ = task
     heading = targets.heading
     zero = jnp.zeros_like(heading[:, 0])
     Rz = jnp.stack(
@@ -74,7 +75,7 @@ def convex(task: PredictionTask) -> Response:
 
 def present(task: PredictionTask) -> Response:
     """Linearised at the present state and forces."""
-    body, start, length, feet, nominal, _, _ = task
+    body, start, length, feet, nominal, *_ = task
     eye = jnp.eye(3, dtype=start.p.dtype)
     omega = srb_spatial.angular_velocity(body, start.R, start.L)
 
@@ -157,4 +158,5 @@ PREDICTIONS: dict[str, Prediction] = {
     "present": present,
     "edmd": learned_models.edmd,
     "bilinear": learned_models.bilinear,
+    "residual": residual_model.residual,
 }

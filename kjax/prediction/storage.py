@@ -61,6 +61,11 @@ def save(path: str | Path, stored: Stored) -> Path:
         arrays |= {"centre": np.asarray(model.centre), "scale": np.asarray(model.scale)}
     else:
         raise ValueError(f"family must be 'residual' or 'learned', got {stored.family!r}")
+    return write(path, arrays)
+
+
+def write(path: str | Path, arrays: Mapping[str, Any]) -> Path:
+    """Write a model's arrays whole or not at all; returns the file."""
     file = _with_suffix(path)
     scratch = file.with_name(f".{file.name}.part{_SUFFIX}")
     try:
@@ -83,15 +88,9 @@ def load(path: str | Path, family: str) -> Stored:
         model's, of another family, or with an array that is missing, not real, not finite, or of
         another shape than the family and the other arrays ask for.
     """
-    file = resolve(path)
-    if not file.name:
-        raise _fault(file, "is no file")
-    arrays = _read(file)
     if family not in ("residual", "learned"):
         raise ValueError(f"family must be 'residual' or 'learned', got {family!r}")
-    held = str(arrays["family"]) if _is_word(arrays.get("family")) else "no model"
-    if held != family:
-        raise _fault(file, f"holds {held[:40]}, wanted a {family} model")
+    file, arrays = read(path, family)
     try:
         if family == "residual":
             own = str(arrays["features"]) if "features" in arrays else "affine"
@@ -100,11 +99,11 @@ def load(path: str | Path, family: str) -> Stored:
             own = "affine"
             shapes = _learned_shapes(arrays)
         for name, shape in {"dt": (), "spread": (len(Mode), STATE_DIM), **shapes}.items():
-            _check_array(name, arrays[name], shape)
+            check_array(name, arrays[name], shape)
     except KeyError as error:
-        raise _fault(file, f"lacks {error}") from None
+        raise fault(file, f"lacks {error}") from None
     except ValueError as error:
-        raise _fault(file, str(error)) from None
+        raise fault(file, str(error)) from None
     if family == "residual":
         params: Any = arrays["W"]
     else:
@@ -117,8 +116,24 @@ def load(path: str | Path, family: str) -> Stored:
     for name, least in (("dt", "above 0"), ("scale", "above 0"), ("spread", "of at least 0")):
         values = arrays.get(name, np.ones(()))
         if (values < 0).any() or (least == "above 0" and (values == 0).any()):
-            raise _fault(file, f"{name} holds {values.min():g}, wanted values {least}")
+            raise fault(file, f"{name} holds {values.min():g}, wanted values {least}")
     return Stored(family, float(arrays["dt"]), params, arrays["spread"], own)
+
+
+def read(path: str | Path, family: str) -> tuple[Path, dict[str, Any]]:
+    """The file of a model of this family, and its arrays.
+
+    Raises:
+      ValueError: in one line, for a file that is missing, unreadable, or of another family.
+    """
+    file = resolve(path)
+    if not file.name:
+        raise fault(file, "is no file")
+    arrays = _read(file)
+    held = str(arrays["family"]) if _is_word(arrays.get("family")) else "no model"
+    if held != family:
+        raise fault(file, f"holds {held[:40]}, wanted a {family} model")
+    return file, arrays
 
 
 def resolve(path: str | Path) -> Path:
@@ -133,11 +148,12 @@ def resolve(path: str | Path) -> Path:
 def _with_suffix(path: str | Path) -> Path:
     path = Path(path)
     if not path.name:
-        raise _fault(path, "is no file")
+        raise fault(path, "is no file")
     return path if path.name.endswith(_SUFFIX) else path.with_name(path.name + _SUFFIX)
 
 
-def _fault(file: Path, text: str) -> ValueError:
+def fault(file: Path, text: str) -> ValueError:
+    """What is wrong with a file."""
     return ValueError(f"file: '{file}' {text}")
 
 
@@ -148,7 +164,7 @@ def _read(file: Path) -> dict[str, Any]:
             # A member that is no array, such as text, comes as bytes.
             return {k: v for k, v in content.items() if isinstance(v, np.ndarray)}
     except (AttributeError, TypeError):  # a bare array is no context manager
-        raise _fault(file, "holds no model: it is one bare array (.npy)") from None
+        raise fault(file, "holds no model: it is one bare array (.npy)") from None
     except OSError as error:
         reason = error.strerror or str(error)
     except Exception as error:  # zip, zlib and numpy raise a dozen types for damaged bytes
@@ -160,14 +176,16 @@ def _is_word(value: np.ndarray | None) -> bool:
     return value is not None and value.shape == () and value.dtype.kind == "U"
 
 
-def _check_array(name: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
+def check_array(
+    name: str, values: np.ndarray, shape: tuple[int, ...], rows: str = "contact modes"
+) -> None:
     """Raise a ValueError that says what is wrong with an array of a model."""
     if values.dtype.kind == "c":
         raise ValueError(f"{name} holds complex values, wanted real ones")
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name} holds values of type {values.dtype}, wanted real values")
-    if shape and values.ndim == len(shape) and len(values) != len(Mode):
-        text = f"{name} holds {len(values)} contact modes, wanted {len(Mode)}"
+    if shape and values.ndim == len(shape) and len(values) != shape[0]:
+        text = f"{name} holds {len(values)} {rows}, wanted {shape[0]}"
         raise ValueError(text + ": fit it again, kjax had 5 before" * (len(values) == 5))
     if values.shape != shape:
         raise ValueError(f"{name} has shape {values.shape}, wanted {shape}")

@@ -81,7 +81,7 @@ SPATIAL = {
 }  # fmt: skip
 # What only means something beside other keys, needs a file, or is a list whose length counts.
 LEFT_OUT = {
-    "koopman.file", "gait.times", "command.times", "push.times", "push.lateral",
+    "koopman.file", "spatial.file", "gait.times", "command.times", "push.times", "push.lateral",
     "command.v_y", "command.yaw_rate", "command.roll", "command.pitch",
     "gaits.trot.foothold_front", "gaits.trot.foothold_rear",
     "gaits.trot.reference", "gaits.trot.horizon",

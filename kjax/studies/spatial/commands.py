@@ -61,10 +61,11 @@ def _constant(args: SpatialOptions) -> list[tuple[str, list[RunConfig]]]:
 
 
 def _constant_summary(args: SpatialOptions, done: Done) -> list[Row]:
-    return [_of_command(one, done(command_configs(one, args))) for one in COMMANDS]
+    return [of_command(one, done(command_configs(one, args))) for one in COMMANDS]
 
 
-def _of_command(command: Sequence[float], runs: list[Row]) -> Row:
+def of_command(command: Sequence[float], runs: list[Row]) -> Row:
+    """Record of one command, from the rows of its walks."""
     up = [run for run in runs if run["errors"] is not None]
     falls = sum(run["fell"] for run in runs)
     row: Row = {"command": list(command), "episodes": len(runs), "falls": falls}

@@ -1,0 +1,1 @@
+"""What the rigid body in three dimensions misses of the whole robot; see ``study``."""
