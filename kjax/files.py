@@ -7,6 +7,7 @@ from typing import Any
 
 from kjax.prediction.storage import resolve
 from kjax.robots import get_robot
+from kjax.robots.foreign import is_foreign, model_file
 
 # Config keys that name a file whose content a result depends on.
 FILE_KEYS = ("koopman.file", "spatial.file")
@@ -26,12 +27,20 @@ def file_hashes(config: Any) -> dict[str, str]:
             path = resolve(file)
             hashes[key] = _hash(path.read_bytes()) if path.is_file() else "none"
     robot = getattr(config, "robot", "")
-    if ":" in robot:
-        hashes["robot"] = own_module_hash(robot, get_robot(robot).mjcf.read_bytes())
+    if is_foreign(robot):
+        hashes["robot"] = _hash(model_file(robot).read_bytes())
+    elif ":" in robot:
+        hashes["robot"] = own_module_hash(robot, _model_bytes(robot))
     model = getattr(getattr(config, "koopman", None), "model", "")
     if ":" in model:
         hashes["koopman.model"] = own_module_hash(model)
     return hashes
+
+
+def _model_bytes(robot: str) -> bytes:
+    """Content of the MJCF of a robot in a module; an MjSpec as it is written out."""
+    mjcf = get_robot(robot).mjcf
+    return mjcf.read_bytes() if hasattr(mjcf, "read_bytes") else mjcf.to_xml().encode()
 
 
 def own_module_hash(name: str, more: bytes = b"") -> str:

@@ -100,6 +100,8 @@ class RobotParams(NamedTuple):
         limits by a margin [rad].
       link_inertia: pitch inertia of thigh and calf about their own centres of mass [kg m^2].
       stand_height: of the centre of mass above the ground in the nominal stance [m].
+      joint_inertia: least that a torque of the abduction, thigh and calf joint meets, rotors and
+        recoil included; it bounds the gains of a leg in the air. Infinite: not known [kg m^2].
     """
 
     mass: Float[Array, ""]
@@ -117,6 +119,7 @@ class RobotParams(NamedTuple):
     joint_range: Float[Array, "3 2"]
     link_inertia: Float[Array, "2"]
     stand_height: Float[Array, ""]
+    joint_inertia: Float[Array, "3"] = np.full(3, np.inf)  # type: ignore[assignment]
 
     @property
     def pitch_inertia(self) -> Float[Array, ""]:

@@ -124,10 +124,10 @@ class SimConfig:
     """Friction cone of the contact solver; MJX wants the pyramid [-]."""
     contacts: Literal["all", "feet"] = "all"
     """Which of the robot's bodies touch the ground: all, or the feet only (faster) [-]."""
-    joint_damping: NonNegative = 0.1
-    """Viscous joint damping [N m s/rad]."""
-    joint_armature: NonNegative = 0.01
-    """Reflected rotor inertia [kg m^2]."""
+    joint_damping: NonNegative | None = None
+    """Viscous damping of all joints; where not given, the robot's own (Go1: 0.1) [N m s/rad]."""
+    joint_armature: NonNegative | None = None
+    """Reflected rotor inertia of all joints; likewise (Go1: 0.01) [kg m^2]."""
     payload: NonNegative = 0.0
     """Mass on the trunk, at its centre of mass, that the controller knows nothing of [kg]."""
     delay: NonNegative = 0.0

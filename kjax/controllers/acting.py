@@ -70,8 +70,9 @@ def build_act(base: Base, act_dt: float) -> Act:
         params = tables.params
         sample = _read(observation, params.position_slack.dtype)
         view = base.view(params.robot, facing(state.track), sample.seen)
+        own = swing.for_gait(params.swing, state.clock.gait)
         settings = _LegSettings(
-            swing.for_gait(params.swing, state.clock.gait),
+            swing.steady_gains(own, params.robot, act_dt),
             lateral.for_gait(params.lateral, state.clock.gait),
         )
         feet = _foot_targets(base, params, settings, state, view, sample, act_dt)  # steps 1, 2

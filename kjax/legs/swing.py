@@ -13,6 +13,9 @@ from kjax.types import RobotParams
 LEAVING = 0.1  # part of a swing in which a foot may still touch what it stood on
 RAISED_TIME = 1.0  # s, in which the further height of swings fades after a foot has hit something
 MAX_JOINT_RATE = 20.0  # rad/s; bounds the reference near singular legs
+STEADY = (
+    1.0  # largest damping of a leg in the air, in its inertia over the time between two torques
+)
 
 
 class SwingParams(NamedTuple):
@@ -340,6 +343,19 @@ def spatial_joint_reference(
     angle, hip, trig = spatial.inverse(robot, lever @ body.rotation - robot.hip_pos)
     rates = spatial.joint_rates(robot, hip, trig, drift @ body.rotation)
     return angle, jnp.clip(rates, -MAX_JOINT_RATE, MAX_JOINT_RATE)
+
+
+def steady_gains(params: SwingParams, robot: RobotParams, dt: float) -> SwingParams:
+    """Settings with gains that a leg's inertia bears when its torques hold for ``dt`` [s].
+
+    A damping of more than twice the inertia over the time between two torques makes a joint
+    oscillate from one to the next. Gains scale with the robot's weight, and the legs of some robots
+    are light for it.
+    """
+    most = STEADY * robot.joint_inertia / dt
+    kd = jnp.minimum(params.kd, most)
+    ratio = jnp.where(params.kd > most, kd / jnp.maximum(params.kd, 1e-12), 1.0)
+    return params._replace(kp=params.kp * ratio, kd=kd)
 
 
 def swing_torque(

@@ -32,8 +32,8 @@ class SceneSpec:
       sim_dt: physics step [s].
       cone: of the contact solver, "pyramidal" or "elliptic".
       contacts: bodies that touch the ground: "all" or "feet".
-      joint_damping: [N m s/rad].
-      joint_armature: [kg m^2].
+      joint_damping: of all joints; the robot's own if ``None`` [N m s/rad].
+      joint_armature: likewise [kg m^2].
       contact_threshold: foot force above which the contact sensor fires [N].
       terrain: kind of the terrain, see ``sim.terrain``.
       obstacles: ``count`` of the terrain's config.
@@ -46,8 +46,8 @@ class SceneSpec:
     sim_dt: float
     cone: str
     contacts: str
-    joint_damping: float
-    joint_armature: float
+    joint_damping: float | None
+    joint_armature: float | None
     contact_threshold: float
     terrain: str = "flat"
     obstacles: int = 0

@@ -9,8 +9,10 @@ import numpy as np
 
 from kjax.moved import moved_names
 from kjax.robots import Robot
+from kjax.sim.adapt import adapt
 from kjax.sim.episode import SceneSpec, World
 from kjax.sim.observe import Addresses, find_addresses
+from kjax.sim.read_robot import load_spec
 from kjax.sim.terrain import add_obstacles, place
 
 _CONES = {
@@ -41,8 +43,10 @@ def build_spec(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoco
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.iterations = 30
     for joint in spec.joints:
-        joint.damping[0] = scene.joint_damping
-        joint.armature = scene.joint_armature
+        if scene.joint_damping is not None:
+            joint.damping[0] = scene.joint_damping
+        if scene.joint_armature is not None:
+            joint.armature = scene.joint_armature
     for geom in spec.geoms:
         if scene.contacts == "feet" and geom.name not in robot.feet:
             geom.contype, geom.conaffinity = 0, 0
@@ -73,7 +77,9 @@ def apply_world(robot: Robot, model: mujoco.MjModel, world: World) -> None:
     Raises:
       ValueError: for a field with another number of obstacles.
     """
-    model.body_mass[model.body(robot.trunk).id] = robot.params.trunk_mass + world.payload
+    link = robot.trunk_link_mass
+    own = float(robot.params.trunk_mass) if link is None else link
+    model.body_mass[model.body(robot.trunk).id] = own + world.payload
     model.geom_friction[[model.geom(name).id for name in robot.feet], 0] = world.friction
     model.geom_pos[model.geom("ground").id, 2] = world.ground
     # Computes what follows from the mass as well.
@@ -82,7 +88,10 @@ def apply_world(robot: Robot, model: mujoco.MjModel, world: World) -> None:
 
 def _robot_spec(robot: Robot) -> mujoco.MjSpec:
     """The robot alone; meshes and textures are found beside an MJCF that is a file."""
-    if isinstance(robot.mjcf, Path):
+    if robot.is_read:
+        spec = load_spec(robot.mjcf)
+        adapt(robot, spec)
+    elif isinstance(robot.mjcf, Path):
         spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     else:
         spec = mujoco.MjSpec.from_string(robot.mjcf.read_text(encoding="utf-8"))
@@ -124,6 +133,9 @@ def _add_ground(spec: mujoco.MjSpec, visual: bool) -> None:
 
 def _add_looks(spec: mujoco.MjSpec, trunk: str) -> None:
     """Tiles, light, sky and a camera that follows the robot from its right side."""
+    for texture in list(spec.textures):
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            spec.delete(texture)
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
