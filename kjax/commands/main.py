@@ -28,13 +28,15 @@ VERBS = {
     "tune": ("kjax.studies.tune.study", "tune weights by gradients through the closed loop"),
     "bench": ("kjax.bench.main", "benchmarks: controller, qp, simulation, edmd, gradient, device"),
     "study": ("kjax.commands.study", "other studies by name"),
+    "robot": ("kjax.commands.robot", "what was read of a robot, and whether it walks"),
     "configs": ("kjax.commands.configs", "the shipped configs, or the text of one"),
     "doctor": ("kjax.commands.doctor", "versions, devices, graphics, cache: what is missing"),
 }
 # Extras without which a verb cannot end well; the others' modules say it when they are imported.
 NEEDS = {"run": ("sim", "viz"), "fit": ("viz",), "sweep": ("sim", "sweep", "viz"),
          "reproduce": ("sim", "viz"), "envelope": ("sim", "viz"), "tune": ("sim", "learn", "viz"),
-         "bench": ("sim", "viz"), "study": ("sim", "viz")}  # fmt: skip
+         "bench": ("sim", "viz"), "study": ("sim", "viz"),
+         "robot": ("sim", "viz")}  # fmt: skip
 # What is imported, and the extra that brings it.
 EXTRAS = {
     "sim": ("mujoco", "filelock", "tqdm"),

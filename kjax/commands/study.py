@@ -18,6 +18,7 @@ STUDIES = {
     "spatial_models": "which models of the body in three dimensions predict how far",
     "spatial_walks": "what each of them walks like in three dimensions, tuned alike",
     "spatial_residual": "what the rigid body in three dimensions misses of the whole robot",
+    "robots": "one config on robots of 12 to 127 kg: what each of them can",
     "showreel": "the moving picture of the README: gaits and grounds, one after another",
 }
 _PACKAGES = {
@@ -26,6 +27,7 @@ _PACKAGES = {
     "spatial_models": "kjax.studies.spatial_models.study",
     "spatial_walks": "kjax.studies.spatial_walks.study",
     "spatial_residual": "kjax.studies.spatial_residual.study",
+    "robots": "kjax.studies.robots.study",
 }
 
 

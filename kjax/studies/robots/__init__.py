@@ -1,0 +1,1 @@
+"""One config, many robots; see ``study``."""
