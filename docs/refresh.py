@@ -382,6 +382,8 @@ for _name in (
     "spatial_mjx",
     "spatial_models",
     "spatial_walks",
+    "spatial_residual",
+    "robots",
 ):
     table(_as_left(_name))
 

@@ -15,6 +15,7 @@ from kjax.sim.observe import Addresses, find_addresses
 from kjax.sim.read_robot import load_spec
 from kjax.sim.terrain import add_obstacles, place
 
+_VIEWED = 0.426  # m, legs that the camera's place is for
 _CONES = {
     "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
     "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
@@ -53,7 +54,8 @@ def build_spec(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoco
     _add_base(spec, robot.trunk, scene.base)
     _add_ground(spec, visual)
     if visual:
-        _add_looks(spec, robot.trunk)
+        length = float(robot.params.thigh_length + robot.params.calf_length)
+        _add_looks(spec, robot.trunk, length / _VIEWED)
     add_obstacles(spec, scene.terrain, scene.obstacles)
     return spec
 
@@ -131,8 +133,14 @@ def _add_ground(spec: mujoco.MjSpec, visual: bool) -> None:
     )
 
 
-def _add_looks(spec: mujoco.MjSpec, trunk: str) -> None:
-    """Tiles, light, sky and a camera that follows the robot from its right side."""
+def _add_looks(spec: mujoco.MjSpec, trunk: str, size: float) -> None:
+    """Tiles, light, sky and a camera that follows the robot from its right side.
+
+    Args:
+      spec: of the scene.
+      trunk: name of the robot's.
+      size: of the robot against the Go1: how much further away it is looked at.
+    """
     for texture in list(spec.textures):
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             spec.delete(texture)
@@ -157,12 +165,14 @@ def _add_looks(spec: mujoco.MjSpec, trunk: str) -> None:
     material = spec.add_material(name="ground", texrepeat=[4, 4], texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     spec.body(trunk).add_light(
-        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=[0, -0.6, 3], dir=[0, 0.2, -1]
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
+        pos=[0, -0.6 * size, 3 * size],
+        dir=[0, 0.2, -1],
     )
     spec.body(trunk).add_camera(
         name="side",
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
-        pos=[0.15, -1.25, 0.22],
+        pos=[0.15 * size, -1.25 * size, 0.22 * size],
         xyaxes=[1, 0.12, 0, -0.02, 0.16, 1],
     )
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]

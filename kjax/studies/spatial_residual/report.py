@@ -62,8 +62,8 @@ def figure(record: Row, path: Path) -> None:
     last = [record["prediction"][key][-1] for key in TITLES]
     times = [last[0][name]["median"] / last[1][name]["median"] for name in ("attitude", "place")]
     fig.suptitle(
-        f"After {1e3 * last[0]['time_s']:.0f} ms the residual leaves one {times[0]:.1f}th of the "
-        f"error of the attitude, one {times[1]:.1f}th of that of the place"
+        f"After {1e3 * last[0]['time_s']:.0f} ms the residual has divided the error of the "
+        f"attitude by {times[0]:.1f}, of the place by {times[1]:.1f}"
     )
     fig.savefig(path)
     plt.close(fig)
