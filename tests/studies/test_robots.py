@@ -74,6 +74,8 @@ def test_what_walks_side_by_side_has_one_program_and_can_be_walked():
         ("trot", {"reached": [0.5, 0.1, 0.0]}, False),
         ("trot", {"reached": [0.5, 0.0, 0.2]}, False),
         ("trot", {"tilt_max_deg": [1.0, 20.0]}, False),
+        ("bound", {"tilt_max_deg": [3.0, 20.0]}, True),
+        ("bound", {"tilt_max_deg": [3.0, 40.0]}, False),
         ("turn", {"reached": [0.0, 0.0, 1.5]}, True),
         ("turn", {"reached": [0.0, 0.0, 1.2]}, False),
         ("stand", {"reached": [0.0, 0.0, 0.0]}, True),
