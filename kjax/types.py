@@ -89,7 +89,8 @@ class RobotParams(NamedTuple):
       trunk_mass: mass of the trunk link [kg].
       trunk_com: its centre of mass, trunk frame [m].
       link_mass: mass of hip, thigh and calf link [kg].
-      link_com: (leg, link, xyz) centre of mass of each link in its own frame [m].
+      link_com: (leg, link, xyz) centre of mass of each link in its own frame; x of the thigh and
+        calf of a leg whose knee points ahead counts backwards, as all in its plane does [m].
       hip_pos: (leg, xyz) abduction axis in the trunk frame [m].
       abduction_offset: (leg,) signed lateral offset from hip to thigh, left positive [m].
       thigh_length: hip to knee [m].
@@ -102,6 +103,8 @@ class RobotParams(NamedTuple):
       stand_height: of the centre of mass above the ground in the nominal stance [m].
       joint_inertia: least that a torque of the abduction, thigh and calf joint meets, rotors and
         recoil included; it bounds the gains of a leg in the air. Infinite: not known [kg m^2].
+      knee: (leg,) 1 where the knee points back, -1 where it points ahead: such a leg is the mirror
+        image of the others, its thigh and calf angles count the other way round [-].
     """
 
     mass: Float[Array, ""]
@@ -120,6 +123,7 @@ class RobotParams(NamedTuple):
     link_inertia: Float[Array, "2"]
     stand_height: Float[Array, ""]
     joint_inertia: Float[Array, "3"] = np.full(3, np.inf)  # type: ignore[assignment]
+    knee: Float[Array, "4"] = np.ones(4)  # type: ignore[assignment]
 
     @property
     def pitch_inertia(self) -> Float[Array, ""]:

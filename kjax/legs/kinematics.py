@@ -2,9 +2,10 @@
 
 Leg frame: origin at the thigh joint, x forward, z up, in the trunk's sagittal plane (the trunk
 frame shifted to the hip). Joint angles are the robot's: 0 is straight down, a positive thigh angle
-swings the foot back, the calf angle is negative (knee pointing back).
+swings the foot back, the calf angle is negative (knee pointing back). A leg whose knee points
+ahead is the mirror image: k = -1, and its angles count the other way round.
 
-    x = -l1 sin(q1) - l2 sin(q1 + q2),   z = -l1 cos(q1) - l2 cos(q1 + q2)
+    x = k (-l1 sin(q1) - l2 sin(q1 + q2)),   z = -l1 cos(q1) - l2 cos(q1 + q2)
 """
 
 from typing import NamedTuple
@@ -42,9 +43,10 @@ def leg_trig(joint_pos: Float[Array, "4 3"]) -> LegTrig:
 
 
 def foot_position(robot: RobotParams, trig: LegTrig) -> Float[Array, "n 2"]:
-    """Foot centre (x, z) relative to the thigh joint, trunk frame [m]."""
+    """Foot centres (x, z) of all legs relative to the thigh joints, trunk frame [m]."""
     l1, l2 = robot.thigh_length, robot.calf_length
-    return jnp.stack([-l1 * trig.s1 - l2 * trig.s12, -l1 * trig.c1 - l2 * trig.c12], axis=-1)
+    x = robot.knee * (-l1 * trig.s1 - l2 * trig.s12)
+    return jnp.stack([x, -l1 * trig.c1 - l2 * trig.c12], axis=-1)
 
 
 def foot_jacobian(robot: RobotParams, trig: LegTrig) -> Float[Array, "n 2 2"]:
@@ -52,6 +54,7 @@ def foot_jacobian(robot: RobotParams, trig: LegTrig) -> Float[Array, "n 2 2"]:
     l1, l2 = robot.thigh_length, robot.calf_length
     calf_x, calf_z = -l2 * trig.c12, l2 * trig.s12
     thigh_x, thigh_z = -l1 * trig.c1 + calf_x, l1 * trig.s1 + calf_z
+    thigh_x, calf_x = robot.knee * thigh_x, robot.knee * calf_x
     return jnp.stack(
         [jnp.stack([thigh_x, calf_x], axis=-1), jnp.stack([thigh_z, calf_z], axis=-1)], axis=-2
     )
@@ -60,7 +63,7 @@ def foot_jacobian(robot: RobotParams, trig: LegTrig) -> Float[Array, "n 2 2"]:
 def inverse(
     robot: RobotParams, foot: Float[Array, "n 2"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"], LegTrig]:
-    """Thigh and calf angle that put the foot at ``foot``, knee back, and their trigonometry.
+    """Thigh and calf angle that put the foot at ``foot``, and their trigonometry.
 
     A target out of reach is pulled to the nearest reachable one on the line from the hip.
 
@@ -75,7 +78,7 @@ def inverse(
     foot = jnp.where(at_hip, jnp.stack([jnp.zeros_like(low), -low]), foot)
     square = jnp.sum(foot**2, axis=-1)
     factor = jnp.sqrt(jnp.clip(square, low**2, high**2) / square)
-    x, z = foot[:, 0] * factor, foot[:, 1] * factor
+    x, z = robot.knee * foot[:, 0] * factor, foot[:, 1] * factor
     cosine = (square * factor**2 - l1**2 - l2**2) / (2.0 * l1 * l2)
     folded, straight = jnp.cos(robot.joint_range[2])
     c2 = jnp.clip(cosine, folded, straight)
@@ -196,4 +199,4 @@ def moving_moments(
     q12_rate = q1_rate + joint_vel[:, 2]
     x_rate = z1 * q1_rate + z12 * q12_rate
     z_rate = -(x1 * q1_rate + x12 * q12_rate)
-    return x1 + x12, z1 + z12, x_rate, z_rate
+    return robot.knee * (x1 + x12), z1 + z12, robot.knee * x_rate, z_rate

@@ -167,8 +167,9 @@ def force_rows(
     foot_centre = forecast.foot + up[None]
     local = jnp.einsum("kij,kj->ki", to_body, foot_centre - forecast.path[:, :2]) + lever[None]
     hip = robot.hip_pos[::2, ::2][nodes.end_index]
-    trig: LegTrig = jax.lax.optimization_barrier(inverse(robot, local - hip)[2])
-    torque = jnp.einsum("kij,kil->kjl", foot_jacobian(robot, trig), to_body)  # J^T R^T
+    legs = robot._replace(knee=robot.knee[::2][nodes.end_index])
+    trig: LegTrig = jax.lax.optimization_barrier(inverse(legs, local - hip)[2])
+    torque = jnp.einsum("kij,kil->kjl", foot_jacobian(legs, trig), to_body)  # J^T R^T
     mu = params.friction
     pyramid = jnp.stack([jnp.stack([jnp.ones_like(mu), -mu]), jnp.stack([-jnp.ones_like(mu), -mu])])
     pyramid = jnp.broadcast_to(pyramid, (theta.shape[0], 2, 2))

@@ -17,6 +17,7 @@ from kjax.sim.robot_structure import Structure, at_zero, find_structure, find_tr
 from kjax.types import JOINT_NAMES, Leg, RobotParams
 
 STAND = 0.27 / 0.426  # height of the centre of mass in the nominal stance, leg lengths
+KNEE = 0.1  # rad, that a knee which points ahead is bent by at least
 FOLDED = (1.0, 0.7)  # of that: standing, and a leg at the apex of its swing
 MARGIN = 0.015  # rad, that joints keep from their mechanical ends
 FREE_RANGE = ((-0.8, 0.8), (-1.5, 3.5), (-2.7, -0.5))  # rad, of joints without limits
@@ -31,8 +32,8 @@ class LegGeometry(NamedTuple):
       hip: (3,) on the abduction axis, beside the thigh joint [m].
       offset: from there to the foot's plane, left positive [m].
       lengths: (2,) of thigh and calf [m].
-      angles: (3,) ours [rad].
-      sign: (3,) 1 or -1 [-].
+      angles: (3,) ours, were the knee to point back [rad].
+      sign: (3,) 1 or -1, likewise [-].
     """
 
     hip: np.ndarray
@@ -121,7 +122,10 @@ def _read(
         for joints, foot in zip(found.joints, found.feet, strict=True)
     ]
     sign = np.array([leg.sign for leg in legs])
-    zero = model.qpos0[model.jnt_qposadr[found.joints]] - sign * [leg.angles for leg in legs]
+    angles = np.array([leg.angles for leg in legs])
+    knee = _knees(model, found, sign, angles)
+    sign, angles = ((a * np.stack([np.ones(4), knee, knee], axis=1)) for a in (sign, angles))
+    zero = model.qpos0[model.jnt_qposadr[found.joints]] - sign * angles
     lengths = _alike("thigh and calf lengths", np.array([leg.lengths for leg in legs]))
     groups = [_links(model, joints) for joints in found.joints]
     mass = _alike(
@@ -147,6 +151,8 @@ def _read(
             for group, own in zip(groups, frames, strict=True)
         ]
     )
+    # The plane of a leg whose knee points ahead is looked at from the other side.
+    link_com[:, 1:, 0] *= knee[:, None]
     of_legs = {b for leg in groups for bodies in leg for b in bodies}
     rest = [b for b in _robot_bodies(model, found.trunk) if b not in of_legs]
     ranges = _ranges(model, found, sign, zero)
@@ -166,6 +172,7 @@ def _read(
         joint_range=ranges,
         link_inertia=pitch.mean(axis=0),
         stand_height=np.asarray(STAND * lengths.sum() if stand_height is None else stand_height),
+        knee=knee,
     )
     params = RobotParams(**numbers)
     height = float(params.stand_height)
@@ -360,6 +367,26 @@ def _joint_inertia(
     return least
 
 
+def _knees(
+    model: mujoco.MjModel, found: Structure, sign: np.ndarray, angles: np.ndarray
+) -> np.ndarray:
+    """1 for knees that point back, -1 for those that point ahead (4,).
+
+    The range of the calf's angle tells, or the model's zero configuration; a leg that is straight
+    there has its knee back.
+    """
+    out = np.ones(4)
+    for leg, joint in enumerate(found.joints[:, 2]):
+        at_zero = model.qpos0[model.jnt_qposadr[joint]]
+        low, high = model.jnt_range[joint]
+        has_range = model.jnt_limited[joint] and high > low
+        told = 0.5 * (low + high) if has_range else at_zero
+        bend = angles[leg, 2] + sign[leg, 2] * (told - at_zero)
+        bend = (bend + np.pi) % (2 * np.pi) - np.pi
+        out[leg] = -1.0 if bend > KNEE else 1.0
+    return out
+
+
 def _ranges(
     model: mujoco.MjModel, found: Structure, sign: np.ndarray, zero: np.ndarray
 ) -> np.ndarray:
@@ -379,7 +406,7 @@ def _ranges(
     if out[2, 0] > 0 or out[2, 1] > 0.3 or out[2, 0] > -1.0:
         raise ValueError(
             f"the calf joints bend from {out[2, 0]:.2f} to {out[2, 1]:.2f} rad from the straight "
-            "leg, wanted knees that point back (below -1)"
+            "leg, wanted knees that bend to one side by more than 1 rad"
         )
     if (out[:, 0] >= out[:, 1]).any():
         raise ValueError(f"the legs' joint ranges have nothing in common: {out.tolist()}")

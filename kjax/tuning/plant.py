@@ -182,6 +182,7 @@ def leg_momentum(
     _, _, x_rate, z_rate = moving_moments(robot, trig, rates)
     hips = robot.hip_pos[:, ::2] - plant.com
     about_hips = jnp.sum(hips[:, 0] * z_rate - hips[:, 1] * x_rate)
+    # A leg whose knee points ahead turns the other way round in its mirrored plane.
     # Thigh and calf about the thigh joint: a positive joint rate takes the nose-up sense backwards.
     _, m_thigh, m_calf = robot.link_mass
     thigh, calf = (robot.link_com[:, i, ::2] for i in (1, 2))
@@ -195,7 +196,7 @@ def leg_momentum(
     thighs = -(m_thigh * jnp.sum(thigh**2, axis=1) + plant.link_inertia[0]) * q1
     calves = m_calf * (end[:, 0] * end_rate[:, 1] - end[:, 1] * end_rate[:, 0])
     calves = calves - plant.link_inertia[1] * q12
-    return plant.spin * (about_hips + jnp.sum(thighs + calves))
+    return plant.spin * (about_hips + jnp.sum(robot.knee * (thighs + calves)))
 
 
 def advance(

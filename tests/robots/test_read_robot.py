@@ -63,12 +63,46 @@ def test_other_names_orders_signs_and_zeros_are_found():
         )
 
 
-@pytest.fixture(scope="module", params=ALL)
+def edited(change):
+    spec = mujoco.MjSpec.from_file(str(GO1))
+    change(spec)
+    return spec
+
+
+def with_knees_ahead(spec, legs=("FR", "FL", "RR", "RL")):
+    """The same legs, bent to the other side."""
+    for joint in spec.joints:
+        if joint.name[:2] in legs and joint.name.endswith(("thigh", "calf")):
+            low, high = joint.range
+            joint.range = [-high, -low]
+
+
+def with_rear_knees_ahead(spec):
+    with_knees_ahead(spec, ("RR", "RL"))
+
+
+AHEAD = {with_knees_ahead: [-1.0] * 4, with_rear_knees_ahead: [1.0, 1.0, -1.0, -1.0]}
+
+
+@pytest.fixture(scope="module", params=[*ALL, *AHEAD])
 def case(request):
     """A robot, the model of its own MJCF, and its addresses there."""
-    robot = get_robot(request.param)
+    if callable(request.param):
+        robot = Robot.from_mjcf(edited(request.param), name=request.param.__name__)
+    else:
+        robot = get_robot(request.param)
     model = load_spec(robot.mjcf).compile()
-    return request.param, robot, model, find_structure(model)
+    return robot.name, robot, model, find_structure(model)
+
+
+@pytest.mark.parametrize("change", AHEAD)
+def test_knees_that_point_ahead_are_mirrored(change):
+    params = Robot.from_mjcf(edited(change)).params
+    np.testing.assert_array_equal(params.knee, AHEAD[change])
+    np.testing.assert_allclose(params.joint_range, get_robot(str(GO1)).params.joint_range)
+    own = go1.PARAMS.link_com * np.ones((4, 3, 3))
+    own[:, 1:, 0] *= np.array(AHEAD[change])[:, None]
+    np.testing.assert_allclose(params.link_com, own, atol=1e-12)
 
 
 def pose(robot, model, found, joints, rates=None):
@@ -100,13 +134,15 @@ def test_feet_and_centre_of_mass_are_mujocos(case):
     hip, trig = spatial.hip_trig(q), leg_trig(q)
     foot = robot.params.hip_pos + spatial.foot_position(robot.params, hip, trig)
     np.testing.assert_allclose(data.geom_xpos[found.feet] - base, foot, atol=tolerance)
+    params = jax.tree.map(jnp.asarray, robot.params)
+    back, _, _ = spatial.inverse(params, foot - params.hip_pos)
+    np.testing.assert_allclose(back, joints, atol=1e-9)
     mujoco.mj_subtreeVel(model, data)
     seen = Observation(
         base_pos=jnp.asarray(base), base_quat=jnp.array([1.0, 0.0, 0.0, 0.0]),
         base_vel=jnp.zeros(3), base_ang_vel=jnp.zeros(3), joint_pos=q, joint_vel=jnp.asarray(rates),
         contact=jnp.ones(4, bool),
     )  # fmt: skip
-    params = jax.tree.map(jnp.asarray, robot.params)
     state = spatial.spatial_state(params, jnp.array([1.0, 0.0]), seen)
     np.testing.assert_allclose(state.com, data.subtree_com[found.trunk], atol=10 * tolerance)
     velocity = data.subtree_linvel[found.trunk]
@@ -208,12 +244,6 @@ def test_standing_feet_press_the_robots_weight(case):
 # Other ways of writing the Go1, and what is wrong with some.
 
 
-def edited(change):
-    spec = mujoco.MjSpec.from_file(str(GO1))
-    change(spec)
-    return spec
-
-
 def like_a_menagerie(spec):
     """A floor, a light, a keyframe, position servos, feet without names, an arm and a payload."""
     trunk = spec.body("trunk")
@@ -283,10 +313,10 @@ def with_a_long_leg(spec):
     spec.body("FL_calf").pos = [0.0, 0.0, -0.25]
 
 
-def with_knees_ahead(spec):
+def with_stiff_knees(spec):
     for joint in spec.joints:
         if joint.name.endswith("calf"):
-            joint.range = [0.888, 2.818]
+            joint.range = [-0.5, 0.5]
 
 
 def with_legs_turned(spec):
@@ -302,7 +332,7 @@ def with_legs_turned(spec):
         (without_limits, r"limits no torques: torque_limit=\(abduction, thigh, calf\)"),
         (without_spheres, "has no sphere that touches the ground: feet= names"),
         (with_a_long_leg, "thigh and calf lengths must be alike in all legs"),
-        (with_knees_ahead, "wanted knees that point back"),
+        (with_stiff_knees, "wanted knees that bend to one side"),
         (with_legs_turned, "turns about .0, 1, 0., wanted the trunk's x axis"),
     ],
 )
