@@ -189,14 +189,19 @@ def _check_contact_points(config: RunConfig, robot: RobotParams) -> None:
 
 def _check_weight(config: InSi, robot: RobotParams, one: gait.Gait) -> None:
     """Refuse bounds of the forces that cannot carry the weight, or give more than it."""
-    own = config.gaits[one.name]
+    own, is_spatial = config.gaits[one.name], config.controller == "spatial"
     section = "multiphase" if own.horizon == "multiphase" else "lmpc"
+    section = "spatial" if is_spatial else section
     weight = float(robot.mass) * GRAVITY * one.period
     needed = MARGIN * weight
     standing = sum(phase.duration * sum(phase.stance) for phase in one.phases)
     bounds = ("grf_z_max", "grf_z_min")
-    keys = [setting_key(config, one.name, bound) for bound in bounds]
-    given, least = (standing * gait_setting(config, one.name, bound) for bound in bounds)
+    if is_spatial:
+        keys = [f"spatial.{bound}" for bound in bounds]
+        given, least = (standing * getattr(config.spatial, bound) for bound in bounds)
+    else:
+        keys = [setting_key(config, one.name, bound) for bound in bounds]
+        given, least = (standing * gait_setting(config, one.name, bound) for bound in bounds)
     fraction = getattr(config, section).torque_fraction
     strong = standing * fraction * _calf_force(config, robot, one.name)
     cycle = f"in a cycle of {one.name} ({one.period:g} s)"

@@ -156,7 +156,7 @@ def _read(
     of_legs = {b for leg in groups for bodies in leg for b in bodies}
     rest = [b for b in _robot_bodies(model, found.trunk) if b not in of_legs]
     ranges = _ranges(model, found, sign, zero)
-    numbers: dict[str, Any] = dict(
+    values: dict[str, Any] = dict(
         mass=np.asarray(model.body_mass[rest].sum() + 4 * mass.sum()),
         inertia=np.eye(3),
         trunk_mass=np.asarray(model.body_mass[rest].sum()),
@@ -174,7 +174,7 @@ def _read(
         stand_height=np.asarray(STAND * lengths.sum() if stand_height is None else stand_height),
         knee=knee,
     )
-    params = RobotParams(**numbers)
+    params = RobotParams(**values)
     height = float(params.stand_height)
 
     def standing(height: float) -> np.ndarray:
@@ -189,7 +189,7 @@ def _read(
     return Robot(
         name=name,
         params=RobotParams(
-            **numbers
+            **values
             | {
                 "inertia": 0.5 * (inertia + inertia.T),
                 "joint_inertia": _joint_inertia(model, found, standing, height),
@@ -390,19 +390,23 @@ def _knees(
 def _ranges(
     model: mujoco.MjModel, found: Structure, sign: np.ndarray, zero: np.ndarray
 ) -> np.ndarray:
-    """Angles (3, 2) that all legs reach, ours, a margin inside their ends."""
+    """Angles (3, 2) that all legs reach, ours, a margin inside their interval."""
     out = np.array(FREE_RANGE)
     for kind in range(3):
         for leg, joint in enumerate(found.joints[:, kind]):
             low, high = model.jnt_range[joint]
             if not model.jnt_limited[joint] or high <= low:
                 continue
-            ends = np.sort(sign[leg, kind] * (np.array([low, high]) - zero[leg, kind]))
+            interval = np.sort(sign[leg, kind] * (np.array([low, high]) - zero[leg, kind]))
             # A turn more or less is the same angle.
-            ends -= 2 * np.pi * np.round(ends.mean() / (2 * np.pi))
-            ends += [MARGIN, -MARGIN]
+            interval -= 2 * np.pi * np.round(interval.mean() / (2 * np.pi))
+            interval += [MARGIN, -MARGIN]
             first = leg == 0 or not model.jnt_limited[found.joints[0, kind]]
-            out[kind] = ends if first else [max(out[kind, 0], ends[0]), min(out[kind, 1], ends[1])]
+            out[kind] = (
+                interval
+                if first
+                else [max(out[kind, 0], interval[0]), min(out[kind, 1], interval[1])]
+            )
     if out[2, 0] > 0 or out[2, 1] > 0.3 or out[2, 0] > -1.0:
         raise ValueError(
             f"the calf joints bend from {out[2, 0]:.2f} to {out[2, 1]:.2f} rad from the straight "
@@ -421,7 +425,7 @@ def _torque_limit(
         limit = np.asarray(given, float)
         if limit.shape != (3,) or not (limit > 0).all():
             raise ValueError(
-                f"torque_limit must be three positive numbers (abduction, thigh, calf), got {given}"
+                f"torque_limit must be three positive values (abduction, thigh, calf), got {given}"
             )
         return limit
     limits = np.full(model.njnt, np.inf)

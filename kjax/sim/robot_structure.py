@@ -135,13 +135,13 @@ def _by_place(
     """Index of the front right, front left, rear right and rear left leg."""
     R, origin = data.xmat[trunk].reshape(3, 3), data.xpos[trunk]
     hips = np.array([R.T @ (data.xanchor[one[1]] - origin) for one in legs])
-    centre = hips.mean(axis=0)
+    middle = hips.mean(axis=0)
     order = []
     for leg in Leg:
         fore, left = leg.name[0] == "F", leg.name[1] == "L"
         here = [
             i
-            for i, hip in enumerate(hips - centre)
+            for i, hip in enumerate(hips - middle)
             if (hip[0] > 0) == fore and (hip[1] > 0) == left
         ]
         if len(here) != 1:

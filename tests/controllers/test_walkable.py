@@ -56,6 +56,22 @@ def test_a_gait_is_measured_by_its_own_bounds(name):
     check_walkable(load_config(RunConfig, None, keys | {key: 176.0 / WEIGHT}), go1.PARAMS)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ("grf_z_max", 0.55, r"spatial\.grf_z_max: .*trot .*the feet can give"),
+        ("torque_fraction", 0.2, r"spatial\.torque_fraction: .*trot .*the calf joints can press"),
+    ],
+)
+def test_the_plan_in_three_dimensions_is_measured_by_its_own_bounds(key, value, text):
+    own = {"controller": "spatial", "gait.also": [], "gait.names": ["trot"]}
+    check_walkable(load_config(RunConfig, None, own), go1.PARAMS)
+    # Bounds of the planar plans have no part in it.
+    check_walkable(load_config(RunConfig, None, own | {f"lmpc.{key}": value}), go1.PARAMS)
+    with pytest.raises(ValueError, match=text):
+        check_walkable(load_config(RunConfig, None, own | {f"spatial.{key}": value}), go1.PARAMS)
+
+
 @pytest.mark.parametrize(("gait", "key"), [("trot", "lmpc"), ("bound", "gaits.bound")])
 @pytest.mark.parametrize("height", [0.05, 0.50])
 def test_a_height_that_the_legs_do_not_reach_is_refused(gait, key, height):

@@ -346,7 +346,7 @@ def test_what_a_model_lacks_is_said_in_a_sentence(change, said):
 def test_what_is_asked_for_can_be_given():
     robot = Robot.from_mjcf(edited(without_limits), torque_limit=(20.0, 20.0, 30.0))
     np.testing.assert_array_equal(robot.params.torque_limit, [20.0, 20.0, 30.0])
-    with pytest.raises(ValueError, match="three positive numbers"):
+    with pytest.raises(ValueError, match="three positive values"):
         Robot.from_mjcf(edited(without_limits), torque_limit=(20.0, 20.0))
     with pytest.raises(ValueError, match=r"no body named 'torso', there are .*trunk"):
         Robot.from_mjcf(GO1, trunk="torso")

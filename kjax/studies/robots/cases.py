@@ -44,7 +44,7 @@ class Scale(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class RobotTask:
     """One thing that is asked.
 
     Attributes:
@@ -63,14 +63,14 @@ class Case:
 
 
 CASES = {
-    "stand": Case(title="stand", gait="stand"),
-    "trot": Case(title="trot 0.5 m/s", velocity=(0.5, 0.0, 0.0)),
-    "fast": Case(title="trot 1.0 m/s", velocity=(1.0, 0.0, 0.0)),
-    "sideways": Case(title="sideways 0.3 m/s", velocity=(0.0, 0.3, 0.0)),
-    "turn": Case(title="turn 1.5 rad/s", velocity=(0.0, 0.0, 1.5)),
-    "push": Case(title=f"push {IMPULSE:g} N s", velocity=(0.3, 0.0, 0.0), impulse=IMPULSE),
-    "bound": Case(title="bound 0.5 m/s", velocity=(0.5, 0.0, 0.0), gait="bound_multiphase"),
-    "field": Case(title="the paper's field", velocity=(0.3, 0.0, 0.0), rough=True),
+    "stand": RobotTask(title="stand", gait="stand"),
+    "trot": RobotTask(title="trot 0.5 m/s", velocity=(0.5, 0.0, 0.0)),
+    "fast": RobotTask(title="trot 1.0 m/s", velocity=(1.0, 0.0, 0.0)),
+    "sideways": RobotTask(title="sideways 0.3 m/s", velocity=(0.0, 0.3, 0.0)),
+    "turn": RobotTask(title="turn 1.5 rad/s", velocity=(0.0, 0.0, 1.5)),
+    "push": RobotTask(title=f"push {IMPULSE:g} N s", velocity=(0.3, 0.0, 0.0), impulse=IMPULSE),
+    "bound": RobotTask(title="bound 0.5 m/s", velocity=(0.5, 0.0, 0.0), gait="bound_multiphase"),
+    "field": RobotTask(title="the paper's field", velocity=(0.3, 0.0, 0.0), rough=True),
 }
 
 
