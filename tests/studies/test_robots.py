@@ -166,13 +166,23 @@ def test_check_says_what_failed(tmp_path, walks, capsys):
     assert "all checks passed" in capsys.readouterr().out
 
 
+def test_tune_is_kjax_tune_of_a_robot(monkeypatch):
+    called = []
+    monkeypatch.setattr("kjax.commands.main.start_module", lambda *words: called.append(words) or 0)
+    assert command.main(["tune", TOY, "--updates", "3"]) == 0
+    module, name, words = called[0]
+    assert (module, name) == ("kjax.studies.tune.study", "kjax robot tune")
+    assert words[:3] == ["omni_trot", "--robot", TOY]
+    assert words[-2:] == ["--updates", "3"]
+
+
 def test_show_and_list(capsys):
     assert command.main(["show", "go1"]) == 0
     said = capsys.readouterr().out
     assert "thigh 0.2130 m, calf 0.2130 m, foot 23 mm" in said
     assert "FR_abduction, FR_thigh, FR_calf; sign 1, 1, 1" in said
     assert command.main(["list"]) == 0
-    assert capsys.readouterr().out.splitlines()[0] == "go1"
+    assert capsys.readouterr().out.splitlines()[:3] == ["a1", "go1", "go2"]
     assert command.main([]) == 0
     assert "kjax robot check ROBOT" in capsys.readouterr().out
 
@@ -180,7 +190,9 @@ def test_show_and_list(capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["swim"], "wanted show, check or list"),
+        (["swim"], "wanted show, check, tune or list"),
+        (["tune"], "wanted a robot"),
+        (["tune", "nowhere.xml"], "there is no file"),
         (["show"], "wanted one robot"),
         (["show", "a", "b"], "wanted one robot"),
         (["check"], "wanted a robot"),

