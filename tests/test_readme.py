@@ -20,9 +20,9 @@ from kjax.sim.observe import find_addresses
 from kjax.sim.resolve import build_scene
 
 PAGES = ("README.md", *(f"docs/{name}.md" for name in (
-    "index", "install", "first_walk", "your_own_loop", "gaits", "three_dimensions", "models",
-    "qp", "sweeps", "tuning", "threads", "results", "reproduction", "benchmarks", "notebooks",
-    "conventions", "faq", "changelog", "contributing",
+    "index", "install", "first_walk", "your_own_loop", "your_robot", "gaits", "three_dimensions",
+    "models", "qp", "sweeps", "tuning", "threads", "results", "reproduction", "benchmarks",
+    "notebooks", "conventions", "faq", "changelog", "contributing",
 )))  # fmt: skip
 
 

@@ -14,17 +14,8 @@ from kjax.types import Leg
 
 # Of kjax tune, so that it ends within ten minutes, compilation included.
 SHORT = (
-    "--seconds",
-    "1.2",
-    "--scenarios",
-    "6",
-    "--held-out",
-    "6",
-    "--minutes",
-    "6",
-    "--seeds",
-    "4",
-)
+    "--seconds", "1.2", "--scenarios", "6", "--held-out", "6", "--minutes", "6", "--seeds", "4",
+)  # fmt: skip
 USAGE = """usage: kjax robot show ROBOT       what was read of it
        kjax robot check ROBOT      the same, then let it walk: which checks fail
        kjax robot tune ROBOT       weights of its own, by gradients through its closed loop

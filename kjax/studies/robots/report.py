@@ -72,7 +72,8 @@ def figure(record: Row, path: Path) -> None:
     ax.imshow(shares, cmap="RdYlGn", vmin=0.0, vmax=1.0, aspect="auto", alpha=0.75)
     for i, row in enumerate(shares):
         for j, value in enumerate(row):
-            ax.text(j, i, f"{100 * value:.0f} %", ha="center", va="center", fontsize=7)
+            text = "too weak" if np.isnan(value) else f"{100 * value:.0f} %"
+            ax.text(j, i, text, ha="center", va="center", fontsize=7)
     ax.set_xticks(range(len(names)), [CASES[name].title for name in names], rotation=30, ha="right")
     ax.set_yticks(
         range(len(robots)),
@@ -86,8 +87,9 @@ def figure(record: Row, path: Path) -> None:
 
 
 def _share(found: Row) -> float:
+    """Of the episodes; of a gait that the robot is too weak for there is none."""
     if "refused" in found:
-        return 0.0
+        return float("nan")
     return float(found["success"]["count"] / found["success"]["episodes"])
 
 
