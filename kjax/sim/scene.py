@@ -53,6 +53,8 @@ def build_spec(robot: Robot, scene: SceneSpec, *, visual: bool = True) -> mujoco
             geom.contype, geom.conaffinity = 0, 0
     _add_base(spec, robot.trunk, scene.base)
     _add_ground(spec, visual)
+    if robot.is_read and not visual:
+        spec.compiler.discardvisual = True  # meshes that only look like it: 84 MB of a B2
     if visual:
         length = float(robot.params.thigh_length + robot.params.calf_length)
         _add_looks(spec, robot.trunk, length / _VIEWED)

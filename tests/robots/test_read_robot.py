@@ -225,6 +225,8 @@ def test_a_scene_takes_what_is_the_robots_and_brings_the_rest(case):
     assert model.nkey == 0
     np.testing.assert_allclose(model.body_mass.sum(), float(robot.params.mass), rtol=1e-12)
     assert model.opt.timestep == spec.sim_dt
+    assert model.nbuffer < 2**20  # a batch holds one for each robot: no meshes for looks
+    assert build_model(robot, spec).ngeom >= model.ngeom
     limits = np.tile(robot.params.torque_limit, (4, 1))
     np.testing.assert_array_equal(model.actuator_ctrlrange[at.actuator, 1], limits)
     for leg in range(4):
