@@ -225,7 +225,9 @@ def test_a_scene_takes_what_is_the_robots_and_brings_the_rest(case):
     assert model.nkey == 0
     np.testing.assert_allclose(model.body_mass.sum(), float(robot.params.mass), rtol=1e-12)
     assert model.opt.timestep == spec.sim_dt
-    assert model.nbuffer < 2**20  # a batch holds one for each robot: no meshes for looks
+    # A batch holds one for each robot: of meshes only what collides.
+    looks = (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & (model.geom_conaffinity == 0)
+    assert not looks.any()
     assert build_model(robot, spec).ngeom >= model.ngeom
     limits = np.tile(robot.params.torque_limit, (4, 1))
     np.testing.assert_array_equal(model.actuator_ctrlrange[at.actuator, 1], limits)
