@@ -41,7 +41,7 @@ class Robot:
       name: as in ``robot = ...`` of a config.
       params: geometry, masses, limits: what the controller needs.
       mjcf: the robot without ground and without joints of its trunk; of one that was read, a
-        path or an MjSpec as it is.
+        path or an MjSpec as it is, or ``None`` where there was but a compiled model.
       trunk: name of the trunk's body in the MJCF.
       joints: names of the joints.
       motors: names of the actuators, one newton metre per unit of control.
@@ -84,7 +84,7 @@ class Robot:
         those of the compiled model. Arguments and errors as of ``kjax.sim.read_robot.read_robot``.
 
         Args:
-          source: path of the MJCF or URDF, or an MjSpec.
+          source: path of the MJCF or URDF, an MjSpec, or a compiled MjModel (parameters only).
           name: as in ``robot = ...`` of a config.
           trunk: name of the trunk's body, where it is not the one that moves freely.
           feet: names of the feet's geoms (FR, FL, RR, RL), where they are no spheres.

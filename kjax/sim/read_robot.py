@@ -41,7 +41,7 @@ class LegGeometry(NamedTuple):
 
 
 def read_robot(
-    source: str | Path | mujoco.MjSpec,
+    source: str | Path | mujoco.MjSpec | mujoco.MjModel,
     *,
     name: str = "",
     trunk: str | None = None,
@@ -55,7 +55,8 @@ def read_robot(
     it. The scene brings base, motors and touch sensors of its own.
 
     Args:
-      source: path of the MJCF or URDF, or an MjSpec.
+      source: path of the MJCF or URDF, an MjSpec, or a compiled MjModel, of which the parameters
+        are read: no scene can be built from it.
       name: as in ``robot = ...`` of a config; the path, or the model's name, where not given.
       trunk: name of the trunk's body, where it is not the one that moves freely.
       feet: names of the feet's geoms (FR, FL, RR, RL), where they are no spheres.
@@ -66,10 +67,13 @@ def read_robot(
     Raises:
       ValueError: in one sentence, for what the model lacks, or legs of another kind.
     """
-    spec = load_spec(source)
-    called = name or (spec.modelname if isinstance(source, mujoco.MjSpec) else str(source))
+    if isinstance(source, mujoco.MjModel):
+        spec, called = None, name or "of an MjModel"
+    else:
+        spec = load_spec(source)
+        called = name or (spec.modelname if isinstance(source, mujoco.MjSpec) else str(source))
     try:
-        model, posed = _free(spec, trunk)
+        model, posed = _compiled(source, trunk) if spec is None else _free(spec, trunk)
         found = find_structure(model, trunk, feet)
         return _read(source, called, model, found, posed, torque_limit, stand_height)
     except ValueError as error:
@@ -79,9 +83,7 @@ def read_robot(
 def _free(spec: mujoco.MjSpec, trunk: str | None) -> tuple[mujoco.MjModel, dict[str, float]]:
     """The compiled model, its trunk on a free joint; and joints' angles in its first keyframe."""
     model = spec.compile()
-    posed = {}
-    for joint in range(model.njnt if model.nkey else 0):
-        posed[model.joint(joint).name] = float(model.key_qpos[0, model.jnt_qposadr[joint]])
+    posed = _posed(model)
     body = model.body(find_trunk(model, trunk))
     if not body.name:
         raise ValueError("the trunk's body has no name in the MJCF")
@@ -94,8 +96,28 @@ def _free(spec: mujoco.MjSpec, trunk: str | None) -> tuple[mujoco.MjModel, dict[
     return spec.compile(), posed
 
 
-def load_spec(source: str | Path | mujoco.MjSpec) -> mujoco.MjSpec:
+def _compiled(model: mujoco.MjModel, trunk: str | None) -> tuple[mujoco.MjModel, dict[str, float]]:
+    """The same of a model that is compiled already."""
+    body = find_trunk(model, trunk)
+    joint = model.body_jntadr[body]
+    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError("the trunk of a compiled MjModel must move freely")
+    return model, _posed(model)
+
+
+def _posed(model: mujoco.MjModel) -> dict[str, float]:
+    """Angles of joints in the first keyframe, by name."""
+    joints = range(model.njnt if model.nkey else 0)
+    return {model.joint(j).name: float(model.key_qpos[0, model.jnt_qposadr[j]]) for j in joints}
+
+
+def load_spec(source: str | Path | mujoco.MjSpec | None) -> mujoco.MjSpec:
     """The MjSpec of a file, or a copy of one that is given."""
+    if source is None:
+        raise ValueError(
+            "robot: read from a compiled MjModel, of which no scene can be built; give the "
+            "path of its MJCF, or its MjSpec"
+        )
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
     path = Path(source)
@@ -197,7 +219,7 @@ def _read(
                 "joint_inertia": joint_inertia(model, found, standing, height),
             }
         ),
-        mjcf=source if isinstance(source, mujoco.MjSpec) else Path(source).resolve(),
+        mjcf=_kept(source),
         trunk=model.body(found.trunk).name,
         joints=_names(model, found.joints),
         motors=_MOTORS,
@@ -214,6 +236,13 @@ _MOTORS: JointNames = tuple(
     (f"{leg.name}_abduction", f"{leg.name}_thigh", f"{leg.name}_calf") for leg in Leg
 )
 _TOUCH: LegNames = ("FR_touch", "FL_touch", "RR_touch", "RL_touch")
+
+
+def _kept(source: Any) -> Any:
+    """What scenes are built from."""
+    if isinstance(source, mujoco.MjModel):
+        return None
+    return source if isinstance(source, mujoco.MjSpec) else Path(source).resolve()
 
 
 def _names(model: mujoco.MjModel, joints: np.ndarray) -> JointNames:

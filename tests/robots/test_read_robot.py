@@ -321,6 +321,19 @@ def test_what_hangs_on_the_trunk_is_its_own_and_servos_become_motors():
     np.testing.assert_array_equal(model.actuator_biasprm[at.actuator], 0.0)
 
 
+def test_a_compiled_model_gives_the_parameters_and_no_scene():
+    spec = edited(lambda spec: spec.body("trunk").add_freejoint())
+    robot = Robot.from_mjcf(spec.compile(), name="compiled")
+    whole = get_robot(str(GO1)).params
+    for name, own in robot.params._asdict().items():
+        np.testing.assert_allclose(own, getattr(whole, name), atol=1e-12, err_msg=name)
+    with pytest.raises(ValueError, match="read from a compiled MjModel"):
+        scene_of(robot)
+    fixed = edited(lambda spec: None).compile()
+    with pytest.raises(ValueError, match="trunk of a compiled MjModel must move freely"):
+        Robot.from_mjcf(fixed)
+
+
 def without_a_leg(spec):
     spec.delete(spec.body("RL_hip"))
 
