@@ -135,7 +135,7 @@ def attitude_errors(name):
 
 rms = {}
 fig, ax = plt.subplots(figsize=(7, 4), layout="constrained")
-for name in PREDICTIONS:
+for name in ("momentum", "convex", "present", *learned):
     rms[name] = np.degrees(np.sqrt(np.mean(np.asarray(attitude_errors(name)) ** 2, axis=0)))
     ax.semilogy(1e3 * np.asarray(time), rms[name], "o-", ms=3, label=name)
 ax.set(xlabel="time [ms]", ylabel="error of the attitude, RMS [deg]")

@@ -174,7 +174,7 @@ def test_the_core_imports_neither_mujoco_nor_matplotlib():
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--robot", "go2"], "robot: got 'go2', wanted one of go1"),
+        (["--robot", "go3"], "robot: got 'go3', wanted one of a1, go1, go2"),
         (["--robot", "no_module:ROBOT"], "robot: 'no_module:ROBOT' cannot be loaded"),
         (["--koopman.model", "linar"], "koopman.model: got 'linar'"),
         (["--koopman.model", "residual"], "koopman.file: model = 'residual' needs a file"),

@@ -88,7 +88,8 @@ def test_what_belongs_elsewhere_is_named(both):
 
 def scaled(robot, scale):
     """The robot with all lengths times ``scale``, of the same density."""
-    powers = {"mass": 3, "trunk_mass": 3, "link_mass": 3, "inertia": 5, "torque_limit": 4}
+    powers = {"mass": 3, "trunk_mass": 3, "link_mass": 3, "inertia": 5, "torque_limit": 4,
+              "joint_inertia": 5, "knee": 0}  # fmt: skip
     return robot._replace(
         **{name: leaf * scale ** powers.get(name, 1) for name, leaf in robot._asdict().items()}
     )

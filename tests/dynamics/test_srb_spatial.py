@@ -34,7 +34,7 @@ def case(seed, feet=2):
 
 def integrated(state, contacts, t):
     """SciPy's integrator on quaternion and angular velocity: Euler's equations in the body."""
-    feet, force = contacts
+    feet, force, _ = contacts
 
     def rate(_, y):
         p, v, quat, w = y[:3], y[3:6], y[6:10], y[10:]
