@@ -124,9 +124,12 @@ def load_spec(source: str | Path | mujoco.MjSpec | None) -> mujoco.MjSpec:
     if not path.is_file():
         raise ValueError(f"robot '{path}': there is no such file")
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ValueError(f"robot '{path}': MuJoCo cannot read it: {error}") from None
+    # Of a URDF MuJoCo would make the trunk, which has no joint there, a part of the world.
+    spec.compiler.fusestatic = False
+    return spec
 
 
 def _read(

@@ -321,6 +321,60 @@ def test_what_hangs_on_the_trunk_is_its_own_and_servos_become_motors():
     np.testing.assert_array_equal(model.actuator_biasprm[at.actuator], 0.0)
 
 
+def urdf():
+    """A robot as a URDF: no free joint, no motors, feet on fixed joints."""
+    lines = ['<robot name="mine">']
+
+    def link(name, mass, foot=False):
+        ball = '<collision><geometry><sphere radius="0.02"/></geometry></collision>' * foot
+        lines.append(
+            f'<link name="{name}"><inertial><mass value="{mass}"/><inertia ixx="{0.01 * mass}" '
+            f'iyy="{0.01 * mass}" izz="{0.01 * mass}" ixy="0" ixz="0" iyz="0"/></inertial>{ball}'
+            "</link>"
+        )
+
+    def joint(name, parent, child, xyz, axis=None, low=-1.0, high=1.0):
+        kind = "fixed" if axis is None else "revolute"
+        turns = (
+            f'<axis xyz="{axis}"/><limit lower="{low}" upper="{high}" effort="30" velocity="20"/>'
+        )
+        lines.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{xyz}"/>{turns * (axis is not None)}</joint>'
+        )
+
+    link("base", 8.0)
+    link("battery", 2.0)
+    joint("battery_mount", "base", "battery", "0 0 0.05")
+    for leg, x, y in (("FL", 0.2, 1), ("FR", 0.2, -1), ("RL", -0.2, 1), ("RR", -0.2, -1)):
+        for part, mass in (("hip", 0.5), ("thigh", 1.0), ("calf", 0.2)):
+            link(f"{leg}_{part}", mass)
+        link(f"{leg}_foot", 0.05, foot=True)
+        joint(f"{leg}_hip_joint", "base", f"{leg}_hip", f"{x} {0.05 * y} 0", "1 0 0")
+        joint(f"{leg}_thigh_joint", f"{leg}_hip", f"{leg}_thigh", f"0 {0.08 * y} 0", "0 1 0", -1, 3)
+        joint(f"{leg}_calf_joint", f"{leg}_thigh", f"{leg}_calf", "0 0 -0.2", "0 1 0", -2.7, -0.8)
+        joint(f"{leg}_foot_fixed", f"{leg}_calf", f"{leg}_foot", "0 0 -0.21")
+    return "\n".join([*lines, "</robot>"])
+
+
+def test_a_urdf_is_read_as_well(tmp_path):
+    path = tmp_path / "mine.urdf"
+    path.write_text(urdf())
+    robot = get_robot(str(path))
+    params = robot.params
+    assert robot.trunk == "base"
+    assert float(params.mass) == pytest.approx(10.0 + 4 * 1.75)
+    assert float(params.trunk_mass) == pytest.approx(10.0)
+    np.testing.assert_allclose(params.trunk_com, [0.0, 0.0, 0.01], atol=1e-12)
+    np.testing.assert_allclose(params.link_mass, [0.5, 1.0, 0.25])
+    np.testing.assert_allclose(params.link_com[0, 2], [0.0, 0.0, -0.21 / 5], atol=1e-12)
+    assert float(params.calf_length) == pytest.approx(0.21)
+    np.testing.assert_allclose(params.torque_limit, 30.0)
+    _, _, model = scene_of(robot)
+    np.testing.assert_allclose(model.body_mass.sum(), float(params.mass), rtol=1e-12)
+    assert (model.nq, model.nu) == (19, 12)
+
+
 def test_a_compiled_model_gives_the_parameters_and_no_scene():
     spec = edited(lambda spec: spec.body("trunk").add_freejoint())
     robot = Robot.from_mjcf(spec.compile(), name="compiled")
