@@ -13,9 +13,7 @@ from kjax.types import RobotParams
 LEAVING = 0.1  # part of a swing in which a foot may still touch what it stood on
 RAISED_TIME = 1.0  # s, in which the further height of swings fades after a foot has hit something
 MAX_JOINT_RATE = 20.0  # rad/s; bounds the reference near singular legs
-STEADY = (
-    1.0  # largest damping of a leg in the air, in its inertia over the time between two torques
-)
+STEADY = 1.0  # largest damping of a leg in the air times the time between torques, over inertia
 
 
 class SwingParams(NamedTuple):
@@ -350,7 +348,8 @@ def steady_gains(params: SwingParams, robot: RobotParams, dt: float) -> SwingPar
 
     A damping of more than twice the inertia over the time between two torques makes a joint
     oscillate from one to the next. Gains scale with the robot's weight, and the legs of some robots
-    are light for it.
+    are light for it. Of the Go1 nothing changes at 1 kHz; with torques held for 5 ms its abduction
+    gains are 15 % lower.
     """
     most = STEADY * robot.joint_inertia / dt
     kd = jnp.minimum(params.kd, most)

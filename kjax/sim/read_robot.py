@@ -14,7 +14,7 @@ import numpy as np
 from kjax.legs.posture import stand_pose
 from kjax.robots.robot import JointNames, LegNames, Robot
 from kjax.sim.robot_limits import joint_inertia, joint_ranges, knees, torque_limits
-from kjax.sim.robot_structure import Structure, at_zero, find_structure, find_trunk
+from kjax.sim.robot_structure import Structure, at_zero, branch, find_structure, find_trunk
 from kjax.types import JOINT_NAMES, Leg, RobotParams
 
 STAND = 0.27 / 0.426  # height of the centre of mass in the nominal stance, leg lengths
@@ -181,7 +181,7 @@ def _read(
     # The plane of a leg whose knee points ahead is looked at from the other side.
     link_com[:, 1:, 0] *= knee[:, None]
     of_legs = {b for leg in groups for bodies in leg for b in bodies}
-    rest = [b for b in _robot_bodies(model, found.trunk) if b not in of_legs]
+    rest = [b for b in branch(model, found.trunk) if b not in of_legs]
     ranges = joint_ranges(model, found, sign, zero)
     values: dict[str, Any] = dict(
         mass=np.asarray(model.body_mass[rest].sum() + 4 * mass.sum()),
@@ -212,7 +212,7 @@ def _read(
     data.qpos[:] = standing(height)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    inertia = R.T @ _inertia(model, data, _robot_bodies(model, found.trunk)) @ R
+    inertia = R.T @ _inertia(model, data, branch(model, found.trunk)) @ R
     return Robot(
         name=name,
         params=RobotParams(
@@ -338,18 +338,9 @@ def _about_y(angle: float) -> np.ndarray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
-def _robot_bodies(model: mujoco.MjModel, root: int) -> list[int]:
-    """A body and all that hang on it."""
-    out = [root]
-    for body in range(root + 1, model.nbody):
-        if model.body_parentid[body] in out:
-            out.append(body)
-    return out
-
-
 def _links(model: mujoco.MjModel, joints: np.ndarray) -> list[list[int]]:
     """Bodies that move with hip, thigh and calf."""
-    below = [_robot_bodies(model, int(model.jnt_bodyid[j])) for j in joints]
+    below = [branch(model, int(model.jnt_bodyid[j])) for j in joints]
     return [
         [b for b in below[0] if b not in below[1]],
         [b for b in below[1] if b not in below[2]],

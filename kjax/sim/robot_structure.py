@@ -101,10 +101,10 @@ def _legs(model: mujoco.MjModel, trunk: int) -> tuple[list[list[int]], list[int]
         if model.body_jntnum[body] == 0:
             rigid.add(body)  # a part of the trunk
             continue
-        branch = _branch(model, body)
-        joints = [j for b in branch for j in _joints_of(model, b)]
+        bodies = branch(model, body)
+        joints = [j for b in bodies for j in _joints_of(model, b)]
         chain = all(
-            model.jnt_bodyid[then] in _branch(model, int(model.jnt_bodyid[now]))
+            model.jnt_bodyid[then] in branch(model, int(model.jnt_bodyid[now]))
             for now, then in pairwise(joints)
         )
         is_leg = len(joints) == 3 and chain and all(model.jnt_type[j] == _HINGE for j in joints)
@@ -115,7 +115,7 @@ def _legs(model: mujoco.MjModel, trunk: int) -> tuple[list[list[int]], list[int]
     return legs, extra
 
 
-def _branch(model: mujoco.MjModel, body: int) -> list[int]:
+def branch(model: mujoco.MjModel, body: int) -> list[int]:
     """A body and all that hang on it."""
     out = [body]
     for b in range(body + 1, model.nbody):
@@ -157,7 +157,7 @@ def _by_place(
 
 def _foot(model: mujoco.MjModel, data: mujoco.MjData, joints: np.ndarray) -> int:
     """The sphere furthest from the calf joint that can touch something."""
-    bodies = _branch(model, int(model.jnt_bodyid[joints[2]]))
+    bodies = branch(model, int(model.jnt_bodyid[joints[2]]))
     spheres = [
         g
         for g in range(model.ngeom)

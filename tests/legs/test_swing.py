@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from kjax import RunConfig, resolve
 from kjax.legs import kinematics, swing
 from kjax.legs.contact import Flags, initial_contact
 from kjax.legs.posture import stand_pose
@@ -441,3 +442,54 @@ def test_points_stay_where_they_are_when_the_frame_moves_on():
     state = swing.carry_along(swinging(0.1), jnp.array([0.3, -0.1]))
     # One rounding of a difference.
     np.testing.assert_allclose(state.lift_off + jnp.array([0.3, -0.1]), LIFT_OFF, atol=1e-15)
+
+
+def gains_of(robot, dt):
+    """Shipped gains of a robot's legs in the air, as they are and as its legs bear them."""
+    given = resolve(RunConfig(), robot)[1].swing
+    borne = swing.steady_gains(given, robot, dt)
+    return [np.asarray(a) for a in (given.kp, given.kd, borne.kp, borne.kd)]
+
+
+def test_gains_of_the_go1_are_its_own_at_1_khz_and_a_little_lower_in_held_torques():
+    kp, kd, kp_borne, kd_borne = gains_of(go1.PARAMS, 0.001)
+    np.testing.assert_array_equal(kp_borne, kp)
+    np.testing.assert_array_equal(kd_borne, kd)
+    kp, kd, kp_borne, kd_borne = gains_of(go1.PARAMS, 0.005)
+    np.testing.assert_allclose(kd_borne / kd, [0.854, 1.0, 0.977], atol=2e-3)
+    np.testing.assert_allclose(kp_borne / kp, kd_borne / kd, rtol=1e-12)
+
+
+def test_a_light_leg_does_not_shake_between_two_torques():
+    """Spot's calf at 5 ms: its rate would go to -3.9 times itself from one torque to the next."""
+    inertia, dt = np.array([0.038, 0.063, 0.0234]), 0.005
+    light = go1.PARAMS._replace(joint_inertia=inertia)
+    given = resolve(RunConfig(), go1.PARAMS)[1].swing._replace(
+        kp=jnp.array([1200.0, 900.0, 900.0]), kd=jnp.array([30.0, 22.7, 22.7])
+    )
+    borne = swing.steady_gains(given, light, dt)
+    before, after = (1.0 - np.asarray(own.kd) * dt / inertia for own in (given, borne))
+    assert before[2] < -3.8
+    assert (np.abs(after) < 0.05).all()
+    # Position and rate of each joint under its own gains, torques held: all eigenvalues within 1.
+    for own, is_steady in ((given, False), (borne, True)):
+        stiff, damp = np.asarray(own.kp)[2], np.asarray(own.kd)[2]
+        step = np.array([
+            [1.0 - dt**2 * stiff / inertia[2], dt * (1.0 - dt * damp / inertia[2])],
+            [-dt * stiff / inertia[2], 1.0 - dt * damp / inertia[2]],
+        ])  # fmt: skip
+        assert (np.abs(np.linalg.eigvals(step)).max() < 1.0) == is_steady
+
+
+def test_where_no_inertia_is_known_gains_stay_and_have_gradients():
+    robot = go1.PARAMS._replace(joint_inertia=jnp.full(3, jnp.inf))
+    given = resolve(RunConfig(), go1.PARAMS)[1].swing
+    given = jax.tree.map(jnp.asarray, given)
+    borne = swing.steady_gains(given, robot, 0.005)
+    np.testing.assert_array_equal(borne.kp, given.kp)
+
+    def total(kd):
+        own = swing.steady_gains(given._replace(kd=kd), robot, 0.005)
+        return own.kp.sum() + own.kd.sum()
+
+    np.testing.assert_array_equal(jax.grad(total)(given.kd), 1.0)
